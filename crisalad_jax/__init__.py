@@ -1,7 +1,7 @@
 """CriSALAD visual place recognition in pure JAX.
 
 The public names are listed once, in `__init__.pyi`, and imported when they are first used, so that
-reading pictures takes no jax and a model no file formats.
+reading images does not import jax, and a model does not import file formats.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""The program `crisalad`, also `python -m crisalad_jax`: the command line as a process."""
+"""Run the command line: the program `crisalad`, or `python -m crisalad_jax`."""
 
 import io
 import os
@@ -10,7 +10,7 @@ from crisalad_jax.utils.signals import end_at_signals
 
 
 def main() -> None:
-    """Run the command that the arguments name, and end the process with its exit code."""
+    """Run the command that the arguments name, and exit with its code."""
     end_at_signals()
     keep_on_without_reader()
     # Imported after signals are handled, because it takes a while.
@@ -19,7 +19,7 @@ def main() -> None:
     code = run_command(keep_programs=True)
     try:
         sys.stdout.flush()
-    except InputError as error:  # a full disk, which the last lines met
+    except InputError as error:  # a full disk, met by the last lines
         if not code:
             print(f"crisalad: {error}", file=sys.stderr)
             code = 2
@@ -27,10 +27,10 @@ def main() -> None:
 
 
 def keep_on_without_reader() -> None:
-    """Let the program go on where the reader of its output is gone, as after `| head`.
+    """Let the program continue when the reader of its output is gone, as after `| head`.
 
-    A full disk raises an `InputError` once, at the write or flush that meets it; under standard
-    error it raises none, and the results go on. Letters that the encoding lacks are escaped.
+    A full disk raises an `InputError` once, at the write or flush that meets it; for standard error
+    it raises none, and the program continues. Characters that the encoding lacks are escaped.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -49,7 +49,7 @@ def keep_on_without_reader() -> None:
 class _Output(io.FileIO):
     """A file that drops what is written after its reader is gone, or after an error.
 
-    Python flushes once more at its end, and would end with a traceback of its own.
+    Python flushes once more at exit, which would otherwise print a traceback.
     """
 
     _failed = False

@@ -1,11 +1,11 @@
-"""Entropic optimal transport for aggregation: the public face of `crisalad_jax.nn.transport`.
+"""Entropic optimal transport for aggregation: the public API of `crisalad_jax.nn.transport`.
 
 The problem is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo and Civera, CVPR
 2024) took from SuperGlue (Sarlin et al., CVPR 2020). Arrays are laid out (..., N, K): N rows
 (patches), K columns (clusters, and the dustbin last), which runs faster than the published (K, N).
-`docs/sinkhorn.md` says which variant is for what, and has the equations.
+`docs/sinkhorn.md` says when to use which variant, and gives the equations.
 
-A step, a dustbin or a gradient of your own is registered as the built-in ones are:
+Register a custom step, dustbin or gradient as the built-in ones are:
 
     @register_step("capacity")
     def capacity(problem, potentials):

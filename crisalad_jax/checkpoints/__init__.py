@@ -1,1 +1,1 @@
-"""Files of models: weights, states of a run, public checkpoints and exported programs."""
+"""Model files: weights, states of a run, public checkpoints and exported programs."""

@@ -1,7 +1,7 @@
-"""The cache of published models: each is downloaded once, checked, and kept as a weight file.
+"""The cache of published models: each is downloaded once, checked, and stored as a weight file.
 
-A model has a folder in `user_cache() / "models"`, with the published file, the file of weights
-that was made of it, and a record of the published file's SHA-256 after its first download.
+A model has a folder in `user_cache() / "models"`, with the published file, the weight file that was
+made from it, and a record of the published file's SHA-256 at its first download.
 """
 
 import contextlib
@@ -26,10 +26,9 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.version import VERSION
 
 MIRROR = "CRISALAD_MIRROR"
-"""Variable of the environment: where to look for files by their names before their published
-addresses."""
+"""Environment variable: where to look for files by their names before their published addresses."""
 _RECORD = "record.json"
-"""File with the weights of a published model in the cache."""
+"""File next to the weights of a published model in the cache."""
 
 
 def is_cached(model: Published) -> bool:
@@ -40,8 +39,8 @@ def is_cached(model: Published) -> bool:
 def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
     """Return a published model's weights in the cache; download and convert them the first time.
 
-    Of two processes one downloads, and the other waits for it. The weights have a checksum of their
-    own, which `load_weights` checks. Another version of this package converts them again, and
+    If two processes need it, one downloads and the other waits. The weights have their own
+    checksum, which `load_weights` checks. Another version of this package converts them again, and
     compares the SHA-256 of the published file with that of the first download.
 
     Args:
@@ -52,10 +51,10 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
         A file of this package.
 
     Raises:
-        InputError: what `download` and `read_checkpoint` raise; the file is not the one that was
-            downloaded first, or no such model; it is not here and the network is forbidden, or it
-            has no address of its own; torch is needed and not installed; or the cache cannot be
-            written to.
+        InputError: what `download` and `read_checkpoint` raise; the file differs from the first
+            download, or is not this model; it is not here and the network is disabled, or it has no
+            address of its own; torch is needed but not installed; or the cache cannot be written
+            to.
     """
     if not _is_ready(model):
         try:
@@ -66,9 +65,9 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
 
 
 def _make(model: Published, *, quiet: bool) -> None:
-    """Download a published model if need be, and convert it.
+    """Download a published model if needed, and convert it.
 
-    What was downloaded just now is removed if it is not the model.
+    A file that was just downloaded is removed if it is not the model.
     """
     published = _folder(model) / model.file
     is_torch = published.suffix not in (MATLAB_SUFFIX, ".safetensors")
@@ -99,16 +98,16 @@ def _weights(model: Published) -> pathlib.Path:
 
 
 def _is_ready(model: Published) -> bool:
-    """Return whether the weights are here, and this version of the package made them."""
+    """Return whether the weights exist, made by this version of the package."""
     if not _weights(model).is_file():
         return False
-    # Without the published file, as removed for the room, they cannot be made again.
+    # If the published file was removed to save space, they cannot be made again.
     published = _folder(model) / model.file
     return not published.is_file() or _record(model).get("version") == VERSION
 
 
 def _record(model: Published) -> dict[str, Any]:
-    """Read what is known of the published file; nothing before its first download."""
+    """Read the record of the published file; it is empty before the first download."""
     path = _folder(model) / _RECORD
     return read_json(path, "the record of a download") if path.exists() else {}
 
@@ -154,16 +153,16 @@ def _download(model: Published, *, quiet: bool) -> str:
 def _convert(
     model: Published, published: pathlib.Path, address: str | None, *, quiet: bool
 ) -> None:
-    """Make the weights of the published file, and record both.
+    """Convert the published file to weights, and record both.
 
     Args:
         model: the model.
         published: its file.
-        address: from where it was downloaded just now; None for a file that was there before.
+        address: where it was downloaded from just now; None if the file was there before.
         quiet: no progress bar.
 
     Raises:
-        InputError: the file is not the one of the record, or not the model.
+        InputError: the file is not the recorded one, or not the model.
     """
     record, digest = _record(model), sha256_of(published)
     if digest != record.get("sha256", digest):

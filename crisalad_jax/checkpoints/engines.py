@@ -15,15 +15,15 @@ from crisalad_jax.utils.output import warn
 EngineName = Literal["onnxruntime", "openvino"]
 Precision = Literal["float32", "bfloat16"]
 Program = Callable[..., np.ndarray]
-"""A loaded program: its inputs, in their order, to its output."""
+"""A loaded program: a function from its inputs, in order, to its output."""
 
 
 class NotExportableError(InputError):
-    """A model that an engine cannot compute as JAX does: another try would end alike."""
+    """A model that an engine cannot compute as JAX does; trying again would fail the same way."""
 
 
 class ProgramFormat(NamedTuple):
-    """The files of a program that engines run, and the engine that they are of."""
+    """The files of an exported program, and the engine that they are for."""
 
     engine: EngineName
     suffixes: tuple[str, str]
@@ -55,7 +55,7 @@ def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
         raise InputError(f"compute dtype: found {precision} with onnxruntime, expected float32")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
-    # Left to itself it takes the machine's cores, however few this process may use.
+    # By default it uses all of the machine's cores, even if this process may use fewer.
     options.intra_op_num_threads = usable_cores()
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     names = [each.name for each in session.get_inputs()]
@@ -63,7 +63,7 @@ def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
 
 
 def import_openvino() -> Any:
-    """Import OpenVINO without its tools, whose import takes time, and tells its makers of it."""
+    """Import OpenVINO without its tools, whose import takes time and sends telemetry."""
     is_first = "openvino" not in sys.modules
     if is_first:
         sys.modules[_TOOLS] = None  # type: ignore[assignment]
@@ -76,7 +76,7 @@ def import_openvino() -> Any:
 
 def _openvino(path: pathlib.Path, precision: Precision) -> Program:
     openvino = import_openvino()
-    # Left to itself it takes fewer bits where the processor has units for them.
+    # By default it computes in fewer bits if the processor has units for them.
     hint = {"float32": "f32", "bfloat16": "bf16"}[precision]
     core = openvino.Core()
     if precision == "bfloat16" and "BF16" not in core.get_property("CPU", _CAPABILITIES):
@@ -92,22 +92,22 @@ def load_program(
 
     Args:
         engine: its name.
-        path: a file .onnx, or .xml of OpenVINO, which reads both.
-        precision: type of the matrix products; onnxruntime has float32 alone.
+        path: a .onnx file, or OpenVINO's .xml; OpenVINO reads both.
+        precision: type of the matrix products; onnxruntime has only float32.
 
     Returns:
         A function of the program's inputs.
 
     Raises:
         InputError: the engine cannot read the file.
-        ModuleNotFoundError: it is not installed.
+        ModuleNotFoundError: the engine is not installed.
     """
     load = {"onnxruntime": _onnxruntime, "openvino": _openvino}[engine]
     try:
         return load(path, precision)
     except (ModuleNotFoundError, InputError):
         raise
-    except Exception as error:  # each engine has its own, and some are of no class of theirs
+    except Exception as error:  # each engine raises its own errors, and others too
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: {engine} cannot load it: {reason}") from error
 
@@ -116,5 +116,5 @@ def convert_to_openvino(program: pathlib.Path, out: pathlib.Path) -> None:
     """Convert an ONNX program to OpenVINO's two files, `out` and its weights (.bin)."""
     openvino = import_openvino()
     model = openvino.Core().read_model(program)
-    # By default the weights lose half of their bits.
+    # By default the weights are stored in half precision.
     openvino.save_model(model, out, compress_to_fp16=False)

@@ -1,8 +1,8 @@
-"""Export a model as one program that runs without this package: StableHLO, ONNX or OpenVINO's.
+"""Export a model as a program that runs without this package: StableHLO, ONNX or OpenVINO.
 
-An export is a folder with the program, and `manifest.json` describes its inputs and outputs. The
-weights lie beside them unless the program holds them. StableHLO is of `jax.export`. ONNX is made by
-`onnx_format`, and OpenVINO converts that.
+An export is a folder with the program and a `manifest.json` that describes its inputs and outputs.
+The weights are in a separate file unless the program contains them. `jax.export` makes StableHLO,
+`onnx_format` makes ONNX, and OpenVINO converts the latter.
 """
 
 import dataclasses
@@ -50,19 +50,19 @@ from crisalad_jax.utils.target import PORTABLE, STRAIGHT, jax_setting, lowering_
 PROGRAM, WEIGHTS = "describe.jax_export", "weights.safetensors"
 FORMATS = ("stablehlo", *engines.FORMATS)
 TOLERANCE = 1e-5
-"""Largest difference of an exported program's descriptors from those of `describe`, of length 1."""
+"""Largest difference between an exported program's descriptors and `describe`'s, of length 1."""
 GROUPINGS = {
     "single": "every image is described alone",
     "batch": "the images of a call look at each other",
     "any": "images are described together as a mask says",
 }
 _SOURCES = "jax_traceback_in_locations_limit"
-"""JAX's setting: how many lines of source a program has with each operation; none in ours, for they
-differ by disk and by caller."""
+"""JAX's setting: how many source locations a program stores with each operation; none in ours, as
+they depend on the path and the caller."""
 _LARGEST = 2**31
-"""Largest size of a program in bytes: offsets of a flatbuffer and of a protobuf have 31 bits."""
+"""Largest size of a program in bytes: flatbuffer and protobuf offsets have 31 bits."""
 _PROBES = 3
-"""Images that a program of any number of images is checked with."""
+"""Number of images to check a program with, if it takes any number."""
 
 
 @short_repr()
@@ -76,20 +76,20 @@ class ExportConfig:
     """
 
     grouping: Literal["single", "batch", "any"] = "single"
-    """Grouping of a call's images in the cross-image encoder: each alone, or the whole batch. "any"
-    is two programs, of ONNX or OpenVINO: tokens of images, and descriptors of such tokens, where a
-    mask says which image looks at which."""
+    """Grouping of a call's images in the cross-image encoder: each independently, or all of them.
+    "any" is two programs of ONNX or OpenVINO: images to tokens, and tokens to descriptors, with a
+    mask of which image attends to which."""
     batch_size: int | None = None
-    """Number of images in a call; None takes any number, by a symbolic dimension."""
+    """Number of images in a call; None allows any number (a symbolic dimension)."""
     weights_inside: bool = False
-    """Whether the program holds the weights as constants; else it takes them as an argument."""
+    """Whether the weights are constants of the program; if not, they are an argument."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
-    """Platforms of StableHLO; the other formats are for any that their engines run on."""
+    """Platforms of StableHLO; the other formats run wherever their engines do."""
     format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
     """StableHLO, which JAX runs; ONNX, which most engines read; or OpenVINO's own."""
     pixels: Literal["bytes", "floats"] | None = None
-    """8-bit pixels, which the program normalises, or floats that already are; None is what the
-    model resizes."""
+    """8-bit pixels, which the program normalises, or normalised floats; None is what the model
+    resizes."""
     for_colmap: bool = False
     """Whether an ONNX program has the inputs and outputs that COLMAP's draft of retrieval by global
     descriptors reads: normalised floats (batch, 3, height, width) to `descriptor`."""
@@ -117,13 +117,13 @@ class ExportConfig:
 
 
 def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -> None:
-    """Check that a model can be exported in this way, before the work of tracing it.
+    """Check that a model can be exported in this way, before tracing it.
 
     Raises:
-        InputError: parameters of another configuration; weights inside of 2 GiB or more; transport
-            that must converge; normalisation by neighbourhoods, and floats in; other than
-            ImageNet's, for COLMAP; or products that are not of float32, in another format than
-            StableHLO.
+        InputError: parameters of another configuration; 2 GiB or more of weights inside; optimal
+            transport that must converge; float inputs with local-contrast normalisation;
+            normalisation other than ImageNet's for COLMAP; or products other than float32 in a
+            format other than StableHLO.
     """
     check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
@@ -146,13 +146,12 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
 
 
 def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> export.Exported:
-    """Export the program of `(weights, images)`, or of `images` where the weights are inside.
+    """Export the program of `(weights, images)`, or of `images` if the weights are inside.
 
     `images` are RGB (batch, height, width, 3) of `config.input_size`: 8-bit, or normalised float32
-    where the model resizes floats. The result is their unit descriptors (batch, descriptor).
-    `weights` is a dictionary of the arrays by their dotted
-    names. Nothing in the program depends on the platform that exports it, nor on who calls this.
-    `check_exportable` says what can be exported.
+    if the model resizes floats. The result is their unit descriptors (batch, descriptor). `weights`
+    is a dictionary of the arrays by their dotted names. The program does not depend on the
+    exporting platform or on the caller. `check_exportable` checks what can be exported.
     """
     program = _whole_program(Model(params, config), how)
     run, weights, (images,) = program.run, program.weights, program.inputs.values()
@@ -168,7 +167,7 @@ Shapes = dict[str, jax.ShapeDtypeStruct]
 
 
 class _Program(NamedTuple):
-    """What becomes a program."""
+    """A function to export, with its inputs and output."""
 
     run: Callable[..., Any]
     """A function of the weights and the inputs."""
@@ -196,8 +195,8 @@ def _whole_program(model: Model, how: ExportConfig) -> _Program:
 def _program(
     function: Callable[..., Any], params: Crisalad, inputs: Shapes, output: str
 ) -> _Program:
-    """Make a function of parameters one of the weights by name."""
-    # A dictionary's leaves come in the order of its keys, not in that of the fields.
+    """Turn a function of parameters into one of the weights by name."""
+    # A dictionary's leaves come in the order of its keys, not of the fields.
     weights, tree = named_leaves(params), jax.tree.structure(params)
 
     def run(weights: Mapping[str, Array], *inputs: Array) -> Array:
@@ -232,27 +231,27 @@ def write_export(
     *,
     calibration: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """Write a model as a program into the new folder `out`, whole or not at all.
+    """Write a model as a program into the new folder `out`, atomically.
 
-    A program in another format than StableHLO is run once, and its descriptors are compared with
+    A program in a format other than StableHLO is run once, and its descriptors are compared with
     those of `describe`.
 
     Args:
         out: the folder.
         model: parameters and configuration.
         how: format, platforms, batch size and grouping.
-        calibration: prepared images that products are quantised to int8 with, in ONNX and OpenVINO,
-            by onnxruntime; None keeps float32. Descriptors then differ, and by how much the
-            manifest says.
+        calibration: prepared images with which onnxruntime quantises products to int8, for ONNX and
+            OpenVINO; None leaves float32. Descriptors then differ, and the manifest says by how
+            much.
 
     Returns:
-        The manifest, as manifest.json has it.
+        The content of manifest.json.
 
     Raises:
-        InputError: as `check_exportable`; `out` is a file, or a folder that holds something; or, in
-            another format than StableHLO, the model has an operation that the format lacks, or the
-            program's descriptors differ from those of `describe`.
-        ModuleNotFoundError: the extra of another format than StableHLO is not installed.
+        InputError: what `check_exportable` raises; `out` is a file, or a folder that is not empty;
+            or, in a format other than StableHLO, the model has an operation that the format lacks,
+            or the program's descriptors differ from those of `describe`.
+        ModuleNotFoundError: the extra of a format other than StableHLO is not installed.
 
     Example:
         >>> import jax
@@ -284,7 +283,7 @@ def write_export(
         else:
             own = _write_onnx(folder, model, how, calibration, os.fspath(out))
         digest = model_hash(params, config)
-        if calibration is not None:  # its descriptors are its own
+        if calibration is not None:  # its descriptors differ from the model's
             own |= {"quantised_from": digest}
             parts = (digest, *(own[name]["sha256"] for name in ("program", "weights")))
             digest = hashlib.sha256("".join(parts).encode()).hexdigest()
@@ -310,7 +309,7 @@ def write_export(
 
 
 def _write_stablehlo(folder: pathlib.Path, model: Model, how: ExportConfig) -> dict[str, Any]:
-    """Write the files of `jax.export`, and return what the manifest says of them."""
+    """Write the files of `jax.export`, and return their part of the manifest."""
     exported = export_model(*model, how)
     (folder / PROGRAM).write_bytes(exported.serialize(vjp_order=0))
     weights = None
@@ -331,7 +330,7 @@ def _write_stablehlo(folder: pathlib.Path, model: Model, how: ExportConfig) -> d
 def _write_onnx(
     folder: pathlib.Path, model: Model, how: ExportConfig, calibration: np.ndarray | None, out: str
 ) -> dict[str, Any]:
-    """Write the files of ONNX or OpenVINO, check them, and return what the manifest says."""
+    """Write the files of ONNX or OpenVINO, check them, and return their part of the manifest."""
     from crisalad_jax.checkpoints.onnx_format.program import OPSET, write_onnx
 
     if how.grouping == "any":
@@ -348,7 +347,7 @@ def _write_onnx(
         if calibration is not None:
             from crisalad_jax.checkpoints.onnx_format.quantise import quantise
 
-            # OpenVINO fails to move scales of columns past a reshape.
+            # OpenVINO fails to move per-column scales past a reshape.
             quantise(path, calibration, products, per_channel=how.format == "onnx")
         if how.format == "openvino":
             convert_to_openvino(path, path.with_suffix(".xml"))
@@ -375,9 +374,9 @@ def _write_onnx(
 
 
 def _halves(model: Model, how: ExportConfig) -> dict[str, _Program]:
-    """Return two programs: of images to tokens, and of tokens and a mask to descriptors.
+    """Return two programs: images to tokens, and tokens and a mask to descriptors.
 
-    An image's tokens are one row of numbers: the global token, and then the local ones.
+    An image's tokens are one row of values: the global token, then the local ones.
     """
     params, config = model
     images, shape = _images_shape(config, how), config.token_shape
@@ -406,7 +405,7 @@ def _halves(model: Model, how: ExportConfig) -> dict[str, _Program]:
 def _difference(
     folder: pathlib.Path, names: Sequence[str], model: Model, how: ExportConfig
 ) -> float:
-    """Run a program on images of noise, and compare it with `describe`."""
+    """Run a program on noise images, and compare it with `describe`."""
     params, config = model
     count = how.batch_size or _PROBES
     images = np.random.default_rng(0).integers(0, 256, (count, *config.input_size, 3), np.uint8)
@@ -423,13 +422,13 @@ def _difference(
     for mask in masks:
         expected = np.asarray(describe(params, images, config, mask=jnp.asarray(mask)))
         given = second[0](found, mask) if second else found
-        longest = np.linalg.norm(expected, axis=1).max()  # 1, unless a projection leaves it
+        longest = np.linalg.norm(expected, axis=1).max()  # 1, unless a projection changes it
         worst = max(worst, float(np.abs(given - expected).max() / longest))
     return worst
 
 
 def _images(config: ModelConfig, how: ExportConfig) -> dict[str, Any]:
-    """Say how images are prepared for the program, which has one size, whatever the rule."""
+    """Describe how to prepare images for the program, which has one size, whatever the rule."""
     chain, size = config.preprocessing, config.input_size
     fixed = dataclasses.replace(chain, size_rule="fixed", round_to_patch=False)
     values = {

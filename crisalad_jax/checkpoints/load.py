@@ -33,9 +33,9 @@ def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = Fal
             the name of a published model, as `crisalad models` lists them: it is downloaded once
             into the cache. Or "starter", the small model in this package, or a baseline, "hog" or
             "thumbnail". Or a folder that `crisalad publish` wrote; or hf://OWNER/NAME for such a
-            folder at Hugging Face's hub, with @REVISION and /FILE where wanted (extra `data`).
+            folder at Hugging Face's hub, optionally with @REVISION and /FILE (extra `data`).
         verify: whether to check the bytes of a file of this package against its checksum.
-        quiet: no progress of a download.
+        quiet: whether to hide the progress of a download.
 
     Returns:
         The model: parameters and configuration.
@@ -52,7 +52,7 @@ def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = Fal
         >>> load(folder / "weights.safetensors").config == config
         True
     """
-    # Imported here: the formats of public checkpoints take a tenth of a second, and few need them.
+    # Imported here: the public formats take a tenth of a second to import, and few need them.
     from crisalad_jax.checkpoints.public import read_checkpoint
 
     return read_checkpoint(find_weights(path, quiet=quiet), verify=verify).model
@@ -61,26 +61,26 @@ def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = Fal
 def find_weights(
     weights: str | os.PathLike[str] | None, *, engine: str = "jax", quiet: bool = False
 ) -> pathlib.Path:
-    """Return the file that is meant by a path, or by the name of a published model.
+    """Find the weight file for a path, or for the name of a published model.
 
-    None is the small model in this package, with a note; it has a name, too, "starter". Other names
-    are "hog" and "thumbnail", baselines that learn nothing. A published model is downloaded the
-    first time, and its licence told each time, or once where it forbids commerce: its file says it
-    too. A file of such a name in the working directory is taken instead, with a note.
+    None is the small model in this package, "starter", with a note. Other names are "hog" and
+    "thumbnail", baselines that learn nothing. A published model is downloaded the first time. Its
+    licence is shown each time, or once if it forbids commercial use, because its file says so too.
+    A file of such a name in the working directory takes precedence, with a note.
 
     Args:
-        weights: a path, or a name of `crisalad models`, or None; or hf://OWNER/NAME, where a file
-            is at Hugging Face's hub; or a folder as there are at the hub.
-        engine: any but "jax" takes a folder too, of an exported model; "auto" only if it is one.
+        weights: a path, a name from `crisalad models`, or None; or hf://OWNER/NAME for a file at
+            Hugging Face's hub; or a folder with the layout of one at the hub.
+        engine: any but "jax" also accepts the folder of an exported model, "auto" if it is one.
         quiet: no progress bar.
 
     Returns:
-        The path; for a name, a file of this package in the cache; of the hub, a file in its cache.
+        The path; for a name, a file of this package in the cache; for the hub, one in its cache.
 
     Raises:
         InputError: what `cached_weights` and `download_file` raise; or there is neither such a file
-            nor such a name. The message has the nearest names. Other missing files are for the
-            reader to tell.
+            nor such a name. The message lists the nearest names. Other missing files are left for
+            the reader to report.
 
     Example:
         >>> find_weights("megalok")
@@ -141,7 +141,7 @@ def find_weights(
 
 
 class OpenedModel(NamedTuple):
-    """A model by its file or name, in JAX or another engine."""
+    """A model opened in JAX or another engine, with its name and file."""
 
     model: "Model | Runtime"
     name: str
@@ -159,7 +159,7 @@ def open_model(
     verify: bool = True,
     quiet: bool = False,
 ) -> OpenedModel:
-    """Load a model of this package's for JAX, or open it in another engine.
+    """Load a model of this package in JAX, or open it in another engine.
 
     Args:
         weights: a path or a name, as `find_weights` takes it; or for another engine an exported
@@ -168,14 +168,14 @@ def open_model(
         changed: returns the configuration to describe images with, given the model's.
         groupings: the groupings that images will be described in.
         verify: whether to compare files with their checksums.
-        quiet: no progress of a download.
+        quiet: whether to hide the progress of a download.
 
     Raises:
-        InputError: what `find_weights`, `load_weights` and `open_runtime` raise, or `changed`.
+        InputError: what `find_weights`, `load_weights`, `open_runtime` or `changed` raises.
     """
     file = find_weights(weights, engine=engine, quiet=quiet)
     short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
-    if is_hub(weights):  # its cache has folders named by commits
+    if is_hub(weights):  # its cache has folders named after commits
         short = str(parse_hub(weights))
     name = starter.named(file) if file in starter.FILES.values() else short
     # Imported here: an engine's model is opened without JAX, and JAX's without an engine.

@@ -1,6 +1,6 @@
-"""Read the NetVLAD that its authors published, a MATLAB file, as hloc does.
+"""Read NetVLAD as its authors published it, in a MATLAB file, the way hloc does.
 
-scipy reads it, which runs nothing of the file. Axes of length 1 are dropped, as by hloc's reader.
+scipy reads it, and runs no code of the file. Axes of length 1 are dropped, as in hloc's reader.
 Names and axes of the result are those of hloc's own module.
 """
 
@@ -25,14 +25,14 @@ def read_matlab(path: pathlib.Path) -> Content:
     """Read the weights of a network, and the mean of its images.
 
     Raises:
-        InputError: the file is cut short, or no such network.
+        InputError: the file is truncated, or holds another network.
     """
     content = load_mat(
         path, _EXPECTED, damaged="not a whole MATLAB file", struct_as_record=False, squeeze_me=True
     )
     try:
         network = content["net"]
-        # hloc subtracts the first pixel from all, whatever the image's size.
+        # hloc subtracts the mean image's first pixel from all, whatever the image's size.
         red, green, blue = map(_as_written, network.meta.normalization.averageImage[0, 0])
         state: dict[str, Any] = {}
         for number in CONVOLUTIONS:
@@ -45,7 +45,7 @@ def read_matlab(path: pathlib.Path) -> Content:
         rotation, bias = network.layers[_WHITENING].weights
         state |= {
             "netvlad.score_proj.weight": scores.T[:, :, None],
-            "netvlad.centers": -centers,  # which have the other sign there
+            "netvlad.centers": -centers,  # they have the opposite sign there
             "whiten.weight": rotation.T,
             "whiten.bias": bias,
         }
@@ -59,6 +59,6 @@ def read_matlab(path: pathlib.Path) -> Content:
 
 
 def _as_written(value: Any) -> float:
-    """Return a number of three decimals, such as 123.68, where float32 has just rounded it."""
+    """Recover a number of three decimals, such as 123.68, that was rounded to float32."""
     short = round(float(value), 3)
     return short if np.float32(short) == np.float32(value) else float(value)

@@ -64,23 +64,23 @@ SUFFIXES = {"torch": (".pth", ".pt", ".ckpt"), "safetensors": (".safetensors",)}
 
 @dataclasses.dataclass(frozen=True)
 class _Declared:
-    """What a public checkpoint that we write says of its model."""
+    """The description of the model in a public checkpoint that we write."""
 
     format: str
     config: ModelConfig
     aggregator: dict = dataclasses.field(default_factory=dict)
-    """Of earlier files, and not read."""
+    """Found in earlier files; ignored."""
 
 
 def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
     """Read a public checkpoint, or a file of this package; half precision becomes float32 exactly.
 
-    Torch files are read by `torch.load(weights_only=True)`, which runs no code of the file.
+    Torch files are read with `torch.load(weights_only=True)`, which runs no code of the file.
 
     Raises:
-        InputError: the file is missing, cut short, none of the formats, asks to run code, or does
-            not fit its format (the first names that are missing, unknown or misshaped are listed).
-        ModuleNotFoundError: torch is needed and not installed.
+        InputError: the file is missing, truncated, of none of the formats, asks to run code, or
+            does not fit its format (the first missing, unknown or misshaped names are listed).
+        ModuleNotFoundError: torch is needed but not installed.
     """
     path = pathlib.Path(path)
     check_source(path, "a checkpoint")
@@ -119,7 +119,7 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
 
 
 def _float32(name: str, array: np.ndarray, source: str) -> np.ndarray:
-    """Return an array in float32; counts of batches stay integers."""
+    """Return an array in float32; batch counts stay integers."""
     is_count = name.endswith("num_batches_tracked")
     kinds = ["int64"] if is_count else ["float32", "float16", "bfloat16"]
     if array.dtype.name not in kinds:
@@ -134,19 +134,20 @@ def read_vocabulary(
     backbone: str | os.PathLike[str],
     fields: Mapping[str, Any] | None = None,
 ) -> Checkpoint:
-    """Read a published vocabulary of AnyLoc, one tensor by itself, and its backbone.
+    """Read a published AnyLoc vocabulary, which is a single tensor, and its backbone.
 
     Args:
         path: the vocabulary.
-        backbone: any checkpoint that `read_checkpoint` reads, whose backbone is taken.
-        fields: settings of `AnyLocConfig` that no shape tells: `layer`, `facet`, `assignment`.
+        backbone: any checkpoint that `read_checkpoint` reads; its backbone is used.
+        fields: settings of `AnyLocConfig` that shapes don't show: `layer`, `facet`, `assignment`.
 
     Returns:
-        A whole model. Images keep their sizes, but for sides that are multiples of the patch size.
+        A complete model. Images keep their sizes, except that sides are rounded to multiples of the
+        patch size.
 
     Raises:
-        InputError: what `read_checkpoint` raises of either file; or a vocabulary that is no tensor
-            of words by itself, or of words of another width than the backbone's features.
+        InputError: what `read_checkpoint` raises for either file; or the vocabulary is not a single
+            tensor of words, or its words differ in width from the backbone's features.
     """
     path = pathlib.Path(path)
     check_source(path, "a vocabulary")
@@ -162,7 +163,7 @@ def read_vocabulary(
 
 
 def vocabulary_model(words: int, model: ModelConfig, fields: Mapping[str, Any]) -> ModelConfig:
-    """Return AnyLoc with so many words over the backbone of a model; see `read_vocabulary`."""
+    """Configure AnyLoc with `words` words on the backbone of a model; see `read_vocabulary`."""
     return dataclasses.replace(
         model,
         preprocessing=PreprocessingConfig(size_rule="native", pixels="floats"),
@@ -173,7 +174,7 @@ def vocabulary_model(words: int, model: ModelConfig, fields: Mapping[str, Any]) 
 
 
 def format_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
-    """Choose the public format, stored as the target's suffix says, that holds the whole model."""
+    """Choose a public format for the target's suffix that can hold the complete model."""
     is_safetensors = pathlib.Path(target).suffix in SUFFIXES["safetensors"]
     stored, fallback = ("safetensors", "huggingface") if is_safetensors else ("torch", REFERENCE)
     for name, each in FORMATS.items():
@@ -191,12 +192,12 @@ def write_checkpoint(
 ) -> None:
     """Write a model under public names, as published: nested, prefixed, in the public order.
 
-    A configuration that names and shapes do not show, such as another image size than the published
-    one, is in the metadata of the state, where no other program looks.
+    Settings that names and shapes do not show, such as an image size other than the published one,
+    are stored in the metadata of the state, which other programs ignore.
 
     Raises:
         InputError: the format cannot hold this model, or the file cannot be made.
-        ModuleNotFoundError: torch is needed and not installed.
+        ModuleNotFoundError: torch is needed but not installed.
     """
     path = pathlib.Path(path)
     form = choose("format", format, FORMATS)
@@ -218,7 +219,7 @@ def write_checkpoint(
 
 
 class Conversion(NamedTuple):
-    """A finished conversion: its source and target formats, None for this package's own."""
+    """A finished conversion: its source and target formats; None is this package's own."""
 
     source: str | None
     target: str | None
@@ -241,17 +242,17 @@ def convert(
         source: what `read_checkpoint` reads.
         target: for a public source, a .safetensors file. For one of ours, the public checkpoint.
         format: one of `FORMATS`, for a source of ours; by default the one its parts came from.
-        backbone: the backbone's checkpoint, for a source that is a vocabulary of AnyLoc by itself.
+        backbone: the backbone's checkpoint, for a source that is only an AnyLoc vocabulary.
         fields: see `read_vocabulary`.
-        half: whether to write a file of this package in half precision, of a source of ours too;
+        half: whether to write a file of this package in half precision, also from a source of ours;
             see `save_weights`.
 
     Returns:
         What was read and written.
 
     Raises:
-        InputError: what `read_checkpoint` and `write_checkpoint` raise, or a target or format that
-            does not go with the source. Nothing is written then.
+        InputError: what `read_checkpoint` and `write_checkpoint` raise, or the target or format
+            does not match the source. Nothing is written in that case.
 
     Example:
         >>> import jax
@@ -289,22 +290,22 @@ def convert(
 
 @takes(path=PATH)
 def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) -> Any:
-    """Read the backbone of any checkpoint, for a model of `config`.
+    """Read the backbone of any checkpoint, for a model with the backbone `config`.
 
     Adapters are read if the file has the same kind and sizes; otherwise they are those of `fresh`.
-    Of a ResNet with more stages the first ones are taken.
+    If a ResNet has more stages, the first ones are used.
 
     Args:
         path: what `load` reads.
         config: the backbone of the model.
-        fresh: parameters of such a backbone, whose adapters are taken where the file has none.
+        fresh: parameters of such a backbone, whose adapters are used if the file has none.
 
     Returns:
         The backbone's parameters.
 
     Raises:
-        InputError: what `read_checkpoint` raises, or the backbone is another (all fields that
-            differ are listed).
+        InputError: what `read_checkpoint` raises, or the backbone is a different one (all fields
+            that differ are listed).
 
     Example:
         >>> import jax

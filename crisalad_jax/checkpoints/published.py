@@ -1,4 +1,4 @@
-"""Models that others published, by name: what published.toml says of their files."""
+"""Models that others published, by name, from the table of their files in published.toml."""
 
 import dataclasses
 import difflib
@@ -21,11 +21,11 @@ class Licence:
     """The licence of a repository that publishes a model."""
 
     name: str
-    """SPDX identifier, or words where the repository has no licence."""
+    """SPDX identifier, or a phrase if the repository has no licence."""
     commercial: bool | None = None
-    """Whether it allows commercial use; None where nothing is said."""
+    """Whether it allows commercial use; None if the repository does not say."""
     terms: str = ""
-    """What else a user has to know of it, in words."""
+    """What else a user must know about it, in words."""
 
     def __post_init__(self) -> None:
         """Check the types."""
@@ -33,7 +33,7 @@ class Licence:
 
     @property
     def words(self) -> str:
-        """The licence, and what a user has to know of it."""
+        """The licence, and what a user must know about it."""
         if self.commercial is None:
             return f"{self.name}: its authors have not said who may use it"
         terms = self.terms if self.commercial else "no commercial use"
@@ -45,29 +45,29 @@ class Published:
     """A published model."""
 
     name: str
-    """Name for `--weights` and `load`, of small letters, digits and hyphens."""
+    """Name for `--weights` and `load`, of lower-case letters, digits and hyphens."""
     format: str
     """Format of the file."""
     descriptor: int
-    """Numbers in a descriptor."""
+    """Dimensions of a descriptor."""
     parameters: int
     """Number of parameters, as `crisalad info` counts them."""
     images: str
-    """How images are resized, in words: those of the configuration of its format."""
+    """How images are resized, in the words of its format's configuration."""
     licence: Licence
     repository: str
     """Address of the page that publishes the file."""
     file: str
     """Name of the file, also at a mirror."""
     url: str | None
-    """Address of the file; None where it has none of its own, as in a folder or an archive."""
+    """Address of the file; None if it has none of its own, as in a folder or an archive."""
     paper: str
     """Authors, venue and year."""
     backbone: str = ""
-    """Name of the published model whose backbone the file's vocabulary is of; empty where the file
-    is a whole model."""
+    """Name of the published model whose backbone the file's vocabulary is for; empty if the file is
+    a complete model."""
     note: str = ""
-    """What is not certain of these facts, or has to be done by hand."""
+    """What is uncertain about these facts, or has to be done by hand."""
 
     def __post_init__(self) -> None:
         """Check the types."""
@@ -75,12 +75,12 @@ class Published:
 
     @property
     def notice(self) -> str:
-        """The licence in words, and whose it is."""
+        """The licence in words, and the repository it applies to."""
         return f"{self.licence.words} ({self.repository})"
 
     @property
     def restriction(self) -> str:
-        """The notice of a licence that forbids commerce; otherwise empty."""
+        """The notice of a licence that forbids commercial use; otherwise empty."""
         return self.notice if self.licence.commercial is False else ""
 
 
@@ -90,20 +90,20 @@ _LICENCES: dict[str, Licence] = {}
 
 
 def register_published(text: str) -> None:
-    """Register published models of one's own, and how their files name a model's arrays.
+    """Register custom published models, and how their files name a model's arrays.
 
-    After that their names stand for them: in `load`, `--weights`, `convert`, `models`, `compare`. A
-    file FILE.py that calls this is all that `--plugin FILE.py` needs; it can register the parts of
-    the model, too.
+    Their names then work in `load`, `--weights`, `convert`, `models` and `compare`. A file FILE.py
+    that calls this is all that `--plugin FILE.py` needs; it can also register the parts of the
+    model.
 
     Args:
         text: TOML with the sections of this package's `published.toml` (licence, family) and of its
-            `formats.toml` (chains, tables, backbones, heads, formats). It may use what those two
-            name, and replaces none of it.
+            `formats.toml` (chains, tables, backbones, heads, formats). It may refer to names in
+            those two, but cannot replace them.
 
     Raises:
-        InputError: it is no such TOML, a name is taken, or a model is of no known format or
-            licence. Nothing is registered then.
+        InputError: the text is not such TOML, a name is taken, or the format or licence of a model
+            is unknown. Nothing is registered in that case.
 
     Example:
         >>> register_published(
@@ -126,7 +126,7 @@ def register_published(text: str) -> None:
         >>> published_model("town-gem").url
         'https://town.example/gem.pth'
     """
-    # Imported here: names are completed and listed without JAX.
+    # Imported here, so that names can be completed and listed without JAX.
     from crisalad_jax.checkpoints.formats.families import FORMATS, add_formats
 
     source = "register_published"
@@ -182,10 +182,10 @@ def _models(family: dict[str, Any], licences: dict[str, Licence]) -> Iterator[Pu
 
 
 def published_model(name: str) -> Published:
-    """Look a published model up.
+    """Look up a published model.
 
     Raises:
-        InputError: there is no such model; the message has the nearest names.
+        InputError: there is no such model; the message lists the nearest names.
 
     Example:
         >>> published_model("megaloc").format
@@ -206,11 +206,11 @@ def restriction_of(format: str) -> str:
 
 
 def nearest_names(name: str) -> str:
-    """Return the published names most like this one, as the end of a message."""
+    """Return the published names closest to this one, as the end of a message."""
     plain = _plain(name)
     words = {each: _plain(f"{each} {m.file} {m.repository}") for each, m in PUBLISHED.items()}
     near = [each for each, own in words.items() if plain in own or plain.replace("-", "") in own]
-    # Of a family that is named alone the longest descriptors, which recall the most.
+    # If only a family is named, the longest descriptors come first: they recall the most.
     near.sort(key=lambda each: (each != plain, -PUBLISHED[each].descriptor))
     near += difflib.get_close_matches(plain, [*starter.FILES, *PUBLISHED])
     near = list(dict.fromkeys(near))[:3]

@@ -1,6 +1,6 @@
-"""A model in another engine than JAX: an exported folder, opened. Nothing here imports jax.
+"""Open an exported folder as a model in an engine other than JAX. Nothing here imports jax.
 
-Of a file of weights the export is made once, and kept in the user's cache.
+A weight file is exported once, into the user's cache.
 """
 
 import concurrent.futures
@@ -50,13 +50,13 @@ FORMAT = "crisalad-jax export 1"
 MANIFEST = "manifest.json"
 _EXPECTED = "the manifest of `crisalad export`"
 DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
-"""Names of programs: of images to descriptors, or of the two halves of that."""
+"""Names of programs: images to descriptors, or the two halves of that."""
 
 
 @brief
 @dataclasses.dataclass(frozen=True)
 class Runtime:
-    """A model in an engine, in place of its parameters.
+    """A model in an engine, used in place of its parameters.
 
     Its descriptors are those of `describe` for images of one size.
     """
@@ -65,19 +65,19 @@ class Runtime:
     """The exported folder."""
     engine: EngineName
     digest: str
-    """The `model_hash` of the weights that were exported; of an int8 program one of its own."""
+    """The `model_hash` of the exported weights; an int8 program has its own digest."""
     quantised_from: str | None
-    """The `model_hash` of the weights that an int8 program was made of."""
+    """The `model_hash` of the weights that an int8 program was made from."""
     grouping: str
-    """What the programs are for; see `export.GROUPINGS`."""
+    """How the programs group images; see `export.GROUPINGS`."""
     attends: bool
     """Whether a descriptor depends on the other images of its batch."""
     dim: int
-    """Numbers in a descriptor."""
+    """Dimensions of a descriptor."""
     input_size: Size
     """Height and width of the images that the programs take."""
     fixed_batch: int | None
-    """Number of images of every call; None is any."""
+    """Number of images in every call; None is any."""
     preparation: Preparation
     """How photographs are prepared."""
     model: Mapping[str, Any]
@@ -87,7 +87,7 @@ class Runtime:
     row_dtype = "float32"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let pickle send it to another machine: by the bytes of its files."""
+        """Pickle the bytes of its files, so that another machine can open it."""
         files = {path.name: path.read_bytes() for path in self.folder.iterdir() if path.is_file()}
         return _opened, (files, self.engine, self.model)
 
@@ -107,7 +107,7 @@ class Runtime:
         """Check that the program can describe images under these groupings.
 
         Raises:
-            InputError: it is for images that are described alone, or for a whole call's together.
+            InputError: the program has another grouping.
         """
         if not self.attends or self.grouping == "any":
             return
@@ -119,12 +119,12 @@ class Runtime:
             )
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[np.ndarray, ImageBatch]]:
-        """Yield each batch with a row of numbers for each of its images, which `attend` reads."""
+        """Yield each batch with a row of values for each of its images, which `attend` reads."""
         for batch in batches:
             yield self._rows(batch.images), batch
 
     def describe(self, images: np.ndarray) -> np.ndarray:
-        """Describe prepared images, each as if it were alone (or all together: `grouping`).
+        """Describe prepared images, each independently (or all together: see `grouping`).
 
         Args:
             images: (image, height, width, 3) of `input_size`, as `preparation` makes them.
@@ -133,7 +133,7 @@ class Runtime:
             Descriptors (image, dim).
 
         Raises:
-            InputError: images of another shape or type.
+            InputError: the images have another shape or type.
         """
         rows = self._rows(images)
         return self.attend(rows[None], np.eye(len(rows), dtype=bool)[None])[0]
@@ -153,10 +153,10 @@ class Runtime:
         return np.concatenate([self._first(each) for each in filled])[: len(images)]
 
     def attend(self, rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Make descriptors of the tokens of some groups of images.
+        """Compute descriptors from the tokens of groups of images.
 
         Args:
-            rows: of `tokens`, (group, image, number).
+            rows: from `tokens`, (group, image, number).
             mask: `mask[g, i, j]` allows image i of group g to attend to image j of it.
 
         Returns:
@@ -178,16 +178,16 @@ def open_runtime(
 ) -> Runtime:
     """Open a model in an engine.
 
-    JAX is imported only where `source` is a file of weights that was not exported before.
+    JAX is imported only if `source` is a weight file that was not exported before.
 
     Args:
-        source: a folder of `crisalad export` in a format that the engine reads, or a file of
-            weights of this package.
+        source: a folder of `crisalad export` in a format that the engine reads, or a weight file
+            of this package.
         engine: "onnxruntime" or "openvino".
-        config: a `ModelConfig` as JSON values, whose images and type of matrix products are taken;
-            None is the model's own, in float32. bfloat16 is OpenVINO's alone.
-        any_grouping: whether images are to look at each other in other ways than `source`, a file,
-            would be exported for: each alone.
+        config: a `ModelConfig` as JSON values, which sets image size, preprocessing and compute
+            type; None is the model's own, in float32. Only OpenVINO has bfloat16.
+        any_grouping: whether to export a weight file for any grouping of images, rather than for
+            single images.
         verify: whether to compare files with their checksums.
 
     Returns:
@@ -249,20 +249,20 @@ def open_runtime(
 def fastest_engine(
     source: str | os.PathLike[str], config: Mapping[str, Any], *, any_grouping: bool = False
 ) -> EngineName | Literal["jax"]:
-    """Choose the engine that describes single images fastest, of those that compute what JAX does.
+    """Choose the fastest engine for single images, among those that compute what JAX does.
 
-    ONNX Runtime is before OpenVINO, which starts later and is as fast then (docs/performance.md).
-    Either has to be installed, and is exported for the first time; the export compares its
-    descriptors with JAX's. JAX is chosen where it may have an accelerator, for images in bfloat16
-    or of sizes of their own, for parts of plugins, and where no engine can be used.
+    ONNX Runtime comes before OpenVINO, which starts later and is then as fast
+    (docs/performance.md). The engine must be installed. The first time, the model is exported for
+    it, and the export compares descriptors with JAX's. JAX is chosen if it may have an accelerator,
+    for bfloat16, for images that keep their own sizes, with plug-ins, and if no engine can be used.
 
     Args:
-        source: a file of weights, or an exported folder.
+        source: a weight file, or an exported folder.
         config: a `ModelConfig` as JSON values, as `open_runtime` takes it.
         any_grouping: see `open_runtime`.
 
     Raises:
-        InputError: an exported folder of a program that no installed engine reads.
+        InputError: `source` is an exported folder that no installed engine reads.
     """
     names: tuple[EngineName, ...] = get_args(EngineName)  # in their order
     installed: list[EngineName] = [name for name in names if importlib.util.find_spec(name)]
@@ -282,14 +282,14 @@ def fastest_engine(
     if not fits or loaded_plugins() or _has_accelerator():
         return "jax"
     for engine in installed:
-        with contextlib.suppress(Exception):  # JAX answers then, and its errors are the user's
+        with contextlib.suppress(Exception):  # JAX is used then, and the user sees its errors
             _exported(path, engine, _changes(config), any_grouping, wait=0)
             return engine
     return "jax"
 
 
 def _changes(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of a configuration may be other than in the file that is exported."""
+    """Return the settings that may differ from those of the file to export."""
     return {name: config[name] for name in ("image_size", "preprocessing", "compute_dtype")}
 
 
@@ -302,7 +302,7 @@ def _has_accelerator() -> bool:
 
 
 def _opened(files: Mapping[str, bytes], engine: EngineName, model: Mapping[str, Any]) -> Runtime:
-    """Open what the files of an exported folder hold."""
+    """Open an exported folder, given the bytes of its files."""
     with tempfile.TemporaryDirectory() as folder:
         for name, data in files.items():
             pathlib.Path(folder, name).write_bytes(data)
@@ -312,7 +312,7 @@ def _opened(files: Mapping[str, bytes], engine: EngineName, model: Mapping[str, 
 def _preparation(
     folder: pathlib.Path, manifest: Mapping[str, Any], model: Mapping[str, Any]
 ) -> Preparation:
-    """Return how images are prepared, as asked for or as the model says, if the program takes them.
+    """Return how to prepare images as `model` says, if the program takes such images.
 
     Raises:
         InputError: it does not.
@@ -335,7 +335,7 @@ def _preparation(
 
 
 def _words(size: Sequence[int], dtype: object, chain: PreprocessingConfig) -> str:
-    """Name what a program depends on: sizes, types and normalisation of images."""
+    """Describe the images that a program takes: their size, type and normalisation."""
     height, width = size
     return (
         f"{height} x {width}, {dtype}, normalised by {chain.normalisation} {chain.mean} "
@@ -344,7 +344,7 @@ def _words(size: Sequence[int], dtype: object, chain: PreprocessingConfig) -> st
 
 
 def _check_fixed(source: pathlib.Path, rule: str) -> None:
-    """Check that images have one size, as a program takes them."""
+    """Check that images have a fixed size, which programs require."""
     if rule != "fixed":
         raise InputError(f"{source}: found images of size rule {rule}, expected --resize fixed")
 
@@ -357,7 +357,7 @@ def _load(
     *,
     verify: bool,
 ) -> list[Program]:
-    """Load the programs, while the bytes of their files are compared with their checksums."""
+    """Load the programs, and compare their files with the checksums meanwhile."""
     parts = [manifest, manifest[ATTEND]] if ATTEND in manifest else [manifest]
     entries = [part[name] for part in parts for name in ("program", "weights") if part[name]]
     for entry in entries:
@@ -387,9 +387,9 @@ def _exported(
     *,
     wait: float = 3600,
 ) -> pathlib.Path:
-    """Return the exported folder of a file of weights in the cache; export it the first time.
+    """Return the exported folder of a weight file in the cache; export it the first time.
 
-    `wait` is for another process that exports, in seconds.
+    `wait` is how many seconds to wait for another process that is exporting.
     """
     header = read_header(weights)
     model = header["config"] | changes | {"compute_dtype": "float32"}
@@ -398,7 +398,7 @@ def _exported(
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
     folder = user_cache() / "exports" / key[:32]
     refusal = folder.with_suffix(".txt")
-    if refusal.is_file():  # or each query would try again, for seconds
+    if refusal.is_file():  # otherwise each query would try again, for seconds
         raise NotExportableError(f"{refusal.read_text('utf-8')} (kept in {refusal})")
     if not (folder / MANIFEST).is_file():
         _check_fixed(weights, model["preprocessing"]["size_rule"])
@@ -420,7 +420,7 @@ def _export(
     folder: pathlib.Path,
     engine: EngineName,
 ) -> None:
-    importlib.import_module("onnx")  # before the note, where it is not installed
+    importlib.import_module("onnx")  # raises before the note if it is not installed
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
     from crisalad_jax.checkpoints.weights import load_weights
     from crisalad_jax.nn.config import ModelConfig
@@ -435,7 +435,7 @@ def check_takes_photographs(config: "ModelConfig", source: object) -> None:
     """Check that a model's program takes photographs, not features of them.
 
     Raises:
-        InputError: it takes features.
+        InputError: the program takes features.
     """
     if config.backbone.local_features is not None:
         raise NotExportableError(
@@ -445,15 +445,15 @@ def check_takes_photographs(config: "ModelConfig", source: object) -> None:
 
 
 def read_model(source: str | os.PathLike[str]) -> "ModelConfig":
-    """Read the configuration in a file of weights or an exported folder, without its arrays.
+    """Read the configuration in a weight file or an exported folder, without its arrays.
 
     Raises:
-        InputError: what `read_header` raises, or of the manifest or the configuration.
+        InputError: what `read_header` raises, or the manifest or the configuration is invalid.
     """
     from crisalad_jax.nn.config import ModelConfig
 
     if os.path.isdir(source):
         manifest = read_json(pathlib.Path(source) / MANIFEST, _EXPECTED)
-        plain = {**manifest["model"], "compute_dtype": "float32"}  # which its numbers are
+        plain = {**manifest["model"], "compute_dtype": "float32"}  # the program's type
         return from_plain(ModelConfig, plain, source=str(source))
     return from_plain(ModelConfig, read_header(source)["config"], source=f"{source} (metadata)")

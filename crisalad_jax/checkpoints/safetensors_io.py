@@ -1,4 +1,4 @@
-"""Read and write safetensors files: arrays by name, and one object of JSON with a checksum.
+"""Read and write safetensors files: arrays by name, and one JSON object with a checksum.
 
 The checksum is the SHA-256 of the object and of every array's name, type, shape and bytes.
 """
@@ -32,23 +32,23 @@ EXPECTED_WEIGHTS = (
 def write_safetensors(
     path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
 ) -> None:
-    """Write arrays and texts as a safetensors file, whole or not at all.
+    """Write arrays and texts as a safetensors file, atomically.
 
     Raises:
         InputError: the file cannot be written.
     """
-    # The library writes the memory as it lies, whatever the order of the axes.
+    # The library writes the memory as it is laid out, whatever the order of the axes.
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     with atomic_path(path) as temporary, in_use(folder := temporary_beside(temporary)):
         temporary.touch()
-        # The library writes under a random name in the folder, which a killed process leaves.
+        # The library writes under a random name in the folder; a killed process would leave it.
         folder.mkdir()
         file = folder / temporary.name
         try:
             safetensors.numpy.save_file(arrays, file, metadata=dict(metadata))
-        except safetensors.SafetensorError as error:  # a full disk too
+        except safetensors.SafetensorError as error:  # also if the disk is full
             raise InputError(f"{path}: cannot be written: {error}") from error
-        file.chmod(temporary.stat().st_mode)  # the library's files are their owner's alone
+        file.chmod(temporary.stat().st_mode)  # only the owner can read the library's files
         os.replace(file, temporary)
 
 
@@ -58,13 +58,13 @@ def write_sealed(
     form: str,
     value: Mapping[str, Any],
 ) -> None:
-    """Write arrays and an object with the checksum of both, whole or not at all.
+    """Write arrays and an object with the checksum of both, atomically.
 
     Args:
         path: the file.
         arrays: by name.
-        form: the format and its version, the one key of the metadata: safetensors keeps no order of
-            several.
+        form: the format and its version, the only key of the metadata, because safetensors does not
+            preserve the order of several.
         value: the object, as JSON values.
 
     Raises:
@@ -87,7 +87,7 @@ def _checksum(value: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str
 
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Any]:
-    """Open a file; what is wrong with it is told in one line."""
+    """Open a file, and report what is wrong with it in one line."""
     check_source(path, expected)
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
@@ -110,7 +110,7 @@ def read_safetensors(
         expected: what kind of file, for messages.
 
     Raises:
-        InputError: the file is missing, not whole, of another kind, or has a type that NumPy lacks.
+        InputError: the file is missing, incomplete or of another kind, or has a type NumPy lacks.
     """
     with _opened(path, expected) as file:
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -118,15 +118,15 @@ def read_safetensors(
 
 
 def read_metadata(path: str | os.PathLike[str], expected: str) -> dict[str, str]:
-    """Read the texts of any safetensors file, and no array; see `read_safetensors`."""
+    """Read the metadata of any safetensors file, without arrays; see `read_safetensors`."""
     with _opened(path, expected) as file:
         return file.metadata() or {}
 
 
 def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what a file of weights says of its model, without its arrays.
+    """Read the header of a weight file, without its arrays.
 
-    Nothing is compared with the checksum.
+    The checksum is not verified.
 
     Args:
         weights: the file.
@@ -135,7 +135,7 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
         The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values.
 
     Raises:
-        InputError: the file is missing, not whole, or no file of weights of this package.
+        InputError: the file is missing, incomplete, or not a weight file of this package.
     """
     return _value(weights, read_metadata(weights, EXPECTED_WEIGHTS), WEIGHTS, EXPECTED_WEIGHTS)[0]
 
@@ -149,13 +149,13 @@ def read_sealed(
         path: the file.
         form: its format.
         expected: what kind of file, for messages.
-        verify: whether to check that its contents are those that were written.
+        verify: whether to compare its contents with the checksum.
 
     Returns:
         The object next to the arrays, without its checksum, and the arrays by name.
 
     Raises:
-        InputError: the file is missing, not whole, changed or of another format.
+        InputError: the file is missing, incomplete, changed or of another format.
     """
     metadata, arrays = read_safetensors(path, expected)
     value, checksum = _value(path, metadata, form, expected)

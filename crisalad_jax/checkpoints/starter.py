@@ -1,9 +1,9 @@
-"""The models in this package, there before any download: a small one, and baselines.
+"""The models in this package, available without a download: a small one, and baselines.
 
-docs/starter.md says how the small one was trained, on rendered pictures alone, and what it recalls.
-Histograms of oriented gradients and SeqSLAM's thumbnails have no parameters: their files are a
-configuration. They are no published models: their files are part of the package, and their licence
-the package's.
+docs/starter.md says how the small one was trained, only on rendered images, and what it recalls.
+Histograms of oriented gradients and SeqSLAM's thumbnails have no parameters: their files hold only
+a configuration. None of them is a published model: the files are part of the package, under its
+licence.
 """
 
 import os
@@ -12,24 +12,24 @@ import pathlib
 from crisalad_jax.utils.files import real_path
 
 NAME = "starter"
-"""Its name, for `--weights` and `load`."""
+"""Name of the small model, for `--weights` and `load`."""
 FILE = pathlib.Path(__file__).with_name(f"{NAME}.safetensors")
 FILES = {NAME: FILE, "hog": FILE.with_stem("hog"), "thumbnail": FILE.with_stem("thumbnail")}
 """The files of all models in this package by their names."""
 BEST = "megaloc"
-"""The published model that recalls the most, which a note names."""
+"""The published model with the best recall, which a note names."""
 
 
 def named(weights: str | os.PathLike[str]) -> str:
-    """Return the words for a file of weights in what people read: of one of these its name."""
+    """Return what to call a weight file in output: its path, or the name of one of these."""
     names = (name for name, file in FILES.items() if file == pathlib.Path(weights))
     return next(names, os.fspath(weights))
 
 
 def recorded(weights: str | os.PathLike[str]) -> str:
-    """Return what a map records of where its weights are: a path, or the name of one of these.
+    """Return where a map's weights are, as the map records it: a path, or the name of one of these.
 
-    The package has another place on another machine, where a map may be taken.
+    A map may be moved to another machine, where the package is at another path.
     """
     path = real_path(pathlib.Path(weights))
     if os.fspath(weights) in FILES and not path.exists():
@@ -39,5 +39,5 @@ def recorded(weights: str | os.PathLike[str]) -> str:
 
 
 def resolved(record: str) -> pathlib.Path:
-    """Return the file of weights that a map has a record of, the opposite of `recorded`."""
+    """Return the weight file that a map has recorded; the inverse of `recorded`."""
     return FILES.get(record, pathlib.Path(record))

@@ -1,4 +1,4 @@
-"""Read and write files of torch, which runs no code of theirs."""
+"""Read and write torch files without running any code in them."""
 
 import collections
 import contextlib
@@ -18,15 +18,15 @@ from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 
 DECLARED = "crisalad-jax"
-"""Key of what a public checkpoint that we write says of its model, in the metadata of its state,
-where no other program looks."""
+"""Key of the description of the model in public checkpoints that we write. It is in the metadata of
+the state, which other programs ignore."""
 HOW = "torch.save(model.state_dict(), FILE) writes a file of the weights alone"
 _UNDER = ("state_dict", "model_state_dict", "model", "teacher")
-"""Keys under which files have the state."""
+"""Keys under which files store the state."""
 _PCA = ("mean_", "components_", "explained_variance_")
-"""Arrays of a whitening, which AP-GeM's files have next to the state."""
+"""Arrays of a whitening, which AP-GeM's files store next to the state."""
 _PCA_NAME = "Landmarks_clean"
-"""Name of the published whitening (Revaud et al., ICCV 2019), where a file has several."""
+"""Name of the published whitening (Revaud et al., ICCV 2019), if a file has several."""
 _PCA_CLASSES = tuple(f"sklearn.decomposition.{module}.PCA" for module in ("pca", "_pca"))
 """Class of a pickled whitening: before scikit-learn 0.22, and since."""
 _MOST = 100
@@ -34,21 +34,21 @@ _MOST = 100
 
 
 class Content(NamedTuple):
-    """What a public checkpoint holds."""
+    """The content of a public checkpoint."""
 
     state: dict[str, np.ndarray]
     """Arrays by name."""
     declared: str | None = None
-    """What it says of its model, as JSON, where we wrote it."""
+    """Its description of the model, as JSON, if we wrote it."""
     mean: tuple[float, float, float] | None = None
-    """Red, green and blue that are subtracted from pixels of 0 to 1, where it says so."""
+    """Mean red, green and blue to subtract from pixels of 0 to 1, if it specifies them."""
 
 
 class _Numpy:
-    """A stand-in for an array of NumPy with the weights, for its type, or for a number.
+    """A stand-in for a NumPy array stored with the weights, for its type, or for a scalar.
 
-    Torch refuses a whole file with one, such as the recalls of a training run, and NumPy itself
-    would run on bytes of the file. `array` makes it of what is checked first.
+    Torch rejects any file with one, such as the recalls of a training run, and NumPy's own
+    constructors would run on unchecked bytes. `array` checks the content before it makes the array.
     """
 
     def __init__(self, *made_of: Any) -> None:
@@ -62,7 +62,7 @@ class _Numpy:
         """Return an array of float32 or float64.
 
         Raises:
-            TypeError, ValueError, AttributeError: it is anything else.
+            TypeError, ValueError, AttributeError: the content is anything else.
         """
         _, shape, kind, by_column, data = self.state
         if kind.made_of[0] not in ("f4", "f8") or not isinstance(data, bytes):
@@ -81,14 +81,14 @@ _NUMPY = (
         for name in ("_reconstruct", "scalar")
     ),
 )
-"""What a pickled array or number of NumPy asks for."""
+"""Names that a pickled NumPy array or scalar refers to."""
 
 
 def _stand_in(name: str) -> type:
-    """Make a stand-in for any other class or function that a file names: a dictionary.
+    """Make a stand-in, a dictionary, for any other class or function that a file names.
 
-    Its making runs nothing of the file. Torch fills exactly this kind of dictionary with items, as
-    of a `defaultdict`, and with attributes, as of an `argparse.Namespace`.
+    Making it runs no code of the file. Torch fills exactly this kind of dictionary with items, as
+    for a `defaultdict`, and with attributes, as for an `argparse.Namespace`.
     """
 
     def new(_: type, *__: Any) -> Any:
@@ -100,10 +100,10 @@ def _stand_in(name: str) -> type:
 
 
 def read_torch(path: pathlib.Path) -> Content:
-    """Read the state in a file, under whatever key it is.
+    """Read the state in a file, whichever key it is under.
 
     Raises:
-        InputError: the file is not whole, asks to run code, or has anything but tensors by name.
+        InputError: the file is incomplete, asks to run code, or holds anything but named tensors.
         ModuleNotFoundError: torch is not installed.
     """
     import torch
@@ -122,17 +122,17 @@ def read_torch(path: pathlib.Path) -> Content:
     if strange:
         found = few(sorted(strange))
         raise InputError(f"{path}: found {found}, expected nothing but tensors by name: {HOW}")
-    metadata = getattr(state, "_metadata", None)  # as of any module's state_dict
+    metadata = getattr(state, "_metadata", None)  # as in any module's state_dict
     declared = metadata.get(DECLARED) if isinstance(metadata, dict) else None
     arrays = {name: _array(path, name, x) for name, x in state.items()}
     return Content(arrays | _whitening(path, whole), declared)
 
 
 def _whitening(path: pathlib.Path, whole: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the arrays of AP-GeM's whitening, if there is one: an object, or tensors by name.
+    """Return the arrays of AP-GeM's whitening, if any: stored as an object or as named tensors.
 
     Raises:
-        InputError: it is neither; or the options of its network are others than are read here.
+        InputError: it is neither; or its network has options that are not supported here.
     """
     found = whole.get("pca")
     if not isinstance(found, Mapping):
@@ -164,7 +164,7 @@ def _whitening(path: pathlib.Path, whole: Mapping[str, Any]) -> dict[str, np.nda
 
 
 def _kind(value: Any) -> str:
-    """Name what a file holds in place of a dictionary of tensors."""
+    """Name what a file holds instead of a dictionary of tensors."""
     if isinstance(value, dict):
         return getattr(value, "stands_for", "nothing")
     if hasattr(value, "shape"):
@@ -173,10 +173,10 @@ def _kind(value: Any) -> str:
 
 
 def read_tensor(path: pathlib.Path) -> np.ndarray:
-    """Read a file that is one tensor by itself.
+    """Read a file that holds a single tensor.
 
     Raises:
-        InputError: as `read_torch`; or it is not one.
+        InputError: what `read_torch` raises; or the file holds something else.
     """
     return _array(path, "the content", _load(path))
 
@@ -193,7 +193,7 @@ def _load(path: pathlib.Path) -> Any:
                 _check_uncompressed(file)
                 named = torch.serialization.get_unsafe_globals_in_checkpoint(file)
                 others = sorted(set(named) - set(_NUMPY))
-            else:  # torch tells nothing of what such a file names
+            else:  # torch does not report what such a file names
                 others = list(_PCA_CLASSES)
             stand_ins: list[Any] = [(_stand_in(name), name) for name in others]
             stand_ins += [(_Numpy, name) for name in _NUMPY]
@@ -216,7 +216,7 @@ def _load(path: pathlib.Path) -> Any:
 
 @contextlib.contextmanager
 def _unpacked(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Give the one file in a zip archive that is no file of torch's, or else the file itself.
+    """Yield the single file inside a zip archive that is not torch's, or else the file itself.
 
     Raises:
         InputError: the archive unpacks to far more than its size, or there is no room for it.
@@ -225,7 +225,7 @@ def _unpacked(path: pathlib.Path) -> Iterator[pathlib.Path]:
         names: list[str] = []
         if zipfile.is_zipfile(path):
             archive = stack.enter_context(zipfile.ZipFile(path))
-            # A Mac adds files of its own.
+            # macOS adds its own files.
             names = [n for n in archive.namelist() if not n.endswith("/") and "__MACOSX" not in n]
         if len(names) != 1:
             yield path
@@ -244,10 +244,10 @@ def _unpacked(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def _check_uncompressed(path: pathlib.Path) -> None:
-    """Check that an archive does not unpack to more than its size, as one of torch never does.
+    """Check that an archive does not unpack to more than its size; torch's own never do.
 
-    Torch stores tensors as they are, but reads compressed ones too: some kilobytes could fill any
-    memory.
+    Torch stores tensors uncompressed, but also reads compressed ones: a few kilobytes could fill
+    any memory.
     """
     size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
@@ -275,13 +275,13 @@ def write_torch(
     bare: bool,
     declared: str | None,
 ) -> None:
-    """Write a state as torch does, whole or not at all.
+    """Write a state as torch does, atomically.
 
     Args:
         path: the file.
         state: arrays by name.
         under: key of the file's dictionary that holds the state; empty: the file is the state.
-        bare: whether the file is the one tensor by itself.
+        bare: whether the file is just the one tensor.
         declared: see `Content`.
 
     Raises:
@@ -303,6 +303,6 @@ def write_torch(
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         try:
             torch.save(content, file)
-        except RuntimeError as error:  # torch's, after the disk's own
+        except RuntimeError as error:  # torch raises it after the disk's own error
             reason = error.__context__ if isinstance(error.__context__, OSError) else error
             raise InputError(f"{path}: cannot be written: {str(reason).splitlines()[0]}") from error

@@ -1,7 +1,8 @@
 """Save and load the states that a run resumes from.
 
-orbax writes the states. A test flipped 40 single bits in a stored state: orbax and tensorstore
-detected none, and 39 changed the loaded numbers. The SHA-256 of every file is therefore stored too.
+orbax writes the states. In a test that flipped 40 single bits in a stored state, orbax and
+tensorstore detected none, and 39 changed the loaded values. The SHA-256 of every file is therefore
+stored too.
 """
 
 import contextlib
@@ -28,15 +29,15 @@ from crisalad_jax.utils.pytree import named_leaves
 
 _DROPPED = "dropped"
 _SEAL = "sha256.json"
-# What orbax logs of an error, a page of each of its threads, it raises too.
+# Drop orbax's error logs, a page for each of its threads: it raises the same errors.
 logging.getLogger("absl").addFilter(lambda record: f"{os.sep}orbax{os.sep}" not in record.pathname)
 _show_unraisable = sys.unraisablehook
 
 
 def _show_but_late(unraisable: Any) -> None:
-    """Show an error that no caller gets, but for results that come after the first error.
+    """Show an unraisable error, unless it comes from results that arrive after the first error.
 
-    tensorstore then still tells of its other files to a loop of orbax, which the error has ended.
+    tensorstore then still reports its other files to orbax's event loop, which the error has ended.
     """
     if not isinstance(unraisable.exc_value, RuntimeError) or (
         str(unraisable.exc_value) != "Event loop is closed"
@@ -56,10 +57,10 @@ class SavedState(NamedTuple):
 
 
 class StateStore:
-    """The resumable states of a run (orbax): each step is written whole or not at all."""
+    """The resumable states of a run (orbax): each step is written atomically."""
 
     def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
-        """Open or make the folder; the last `keep` states stay."""
+        """Open or create the folder, which holds the last `keep` states."""
         folder = pathlib.Path(folder).absolute()
         self._folder, self._dropped = folder, folder / _DROPPED
         # Only the primary process has a store: without this orbax would wait for the others.
@@ -87,12 +88,12 @@ class StateStore:
         self._clear()
 
     def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
-        """Write the arrays of `state` and the JSON values of `record`, replacing this step's.
+        """Write the arrays of `state` and the JSON values of `record`, replacing that step's.
 
         It copies the arrays before it returns, and writes the copies in the background.
 
         Raises:
-            InputError: this one, or one before, cannot be written.
+            InputError: this state, or an earlier one, cannot be written.
         """
         with self._written():
             self._manager.wait_until_finished()
@@ -123,8 +124,8 @@ class StateStore:
             return None
         arrays = jax.tree.map(ocp.utils.to_shape_dtype_struct, _stored(template))
         try:
-            # Check before orbax reads any array: it reads all at once, and raises for a misfit in
-            # another thread.
+            # Check before orbax reads any array: it reads all at once, and raises in another thread
+            # if one does not fit.
             problems = self._changed_files(step) or diff_trees(
                 self._manager.item_metadata(step)["state"].tree, arrays
             )
@@ -143,7 +144,7 @@ class StateStore:
                 state=ocp.args.StandardRestore(arrays), record=ocp.args.JsonRestore()
             ),
         )
-        # Convert by numpy: arrays that orbax commits to a device would recompile the step.
+        # Convert with numpy: arrays that orbax commits to a device would recompile the step.
         leaves = [
             jnp.asarray(np.asarray(saved["state"].get(name, leaf)))
             for name, leaf in named_leaves(template).items()
@@ -158,7 +159,7 @@ class StateStore:
         write_json(folder / _SEAL, _hashes(folder))
 
     def _changed_files(self, step: int) -> list[str]:
-        """List the files of a state that are not as they were saved."""
+        """List the files of a state that have changed since they were saved."""
         folder = self._folder / str(step)
         found, saved = _hashes(folder), read_json(folder / _SEAL, "the digests of a state's files")
         return [
@@ -168,12 +169,12 @@ class StateStore:
         ]
 
     def wait(self) -> None:
-        """Wait until all saved states are on the disk; raise as `save`."""
+        """Wait until all saved states are on disk; raise what `save` raises."""
         with self._written():
             self._manager.wait_until_finished()
 
     def close(self) -> None:
-        """Wait for pending writes and close the store; raise as `save`."""
+        """Wait for pending writes and close the store; raise what `save` raises."""
         with self._written():
             self._manager.close()
         self._clear()
@@ -191,7 +192,7 @@ class StateStore:
 
 
 def _words(error: Exception) -> str:
-    """Return what the system said; tensorstore's message has its number after long names."""
+    """Return the system's error message; tensorstore puts its number after long names."""
     number = re.search(r"os_error_code='(\d+)'", str(error))
     return os.strerror(int(number[1])) if number else " ".join(str(error).split())[:200]
 
@@ -199,13 +200,13 @@ def _words(error: Exception) -> str:
 def _hashes(folder: pathlib.Path) -> dict[str, str]:
     """Compute the SHA-256 of all files of a state's arrays and record.
 
-    The files beside these folders are orbax's bookkeeping: it changes them later, and nothing that
-    is loaded depends on what is in them.
+    The files next to these folders are orbax's bookkeeping: it changes them later, and no loaded
+    value depends on them.
     """
     files = (path for path in folder.glob("*/**/*") if path.is_file())
     return {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}
 
 
 def _stored(state: PyTree) -> dict[str, Any]:
-    """Return the leaves by name, without empty ones, which orbax refuses."""
+    """Return the leaves by name, without empty ones, which orbax rejects."""
     return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}

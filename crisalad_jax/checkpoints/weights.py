@@ -1,4 +1,4 @@
-"""Read and write files of weights: safetensors with the configuration and its parts' sources."""
+"""Read and write weight files: safetensors with the configuration and the sources of its parts."""
 
 import dataclasses
 import hashlib
@@ -37,21 +37,21 @@ LOSS = "loss."
 
 @dataclasses.dataclass(frozen=True)
 class Header:
-    """What a file says of its parameters."""
+    """What a weight file records about its parameters."""
 
     config: ModelConfig
     version: str
     """Version of this package that wrote it."""
     parts: dict
-    """Name and source's digest of every part."""
+    """Name and source digest of every part."""
     model_sha256: str
     """The `model_hash` of the parameters."""
     aggregator: dict = dataclasses.field(default_factory=dict)
-    """Of earlier files, and not read."""
+    """Found in earlier files; ignored."""
     loss: dict = dataclasses.field(default_factory=dict)
-    """The run's loss, a `LossConfig` as JSON values, where the file has its parameters."""
+    """The run's loss, a `LossConfig` as JSON values, if the file has its parameters."""
     restriction: str = ""
-    """Notice of a licence that forbids commerce; empty otherwise."""
+    """Notice of a licence that forbids commercial use; empty otherwise."""
 
 
 @brief
@@ -65,9 +65,9 @@ class Checkpoint(NamedTuple):
     format: str | None = None
     """Public format of the file; None for a file of this package."""
     digest: str | None = None
-    """The `model_hash` of the parameters, where a file of this package says it."""
+    """The `model_hash` of the parameters, for a file of this package."""
     loss: tuple[dict, dict[str, np.ndarray]] | None = None
-    """`Header.loss` and the loss's parameters by name, where the file has them."""
+    """`Header.loss` and the loss's parameters by name, if the file has them."""
     restriction: str = ""
     """`Header.restriction`, or that of the public format."""
 
@@ -93,15 +93,15 @@ def save_weights(
         path: the file, a .safetensors.
         model: all parameters, and the configuration.
         extras: arrays of a public checkpoint that no descriptor needs (see `convert`).
-        half: whether to keep float32 parameters as float16, in half the room. They are rounded, and
-            are float32 again when they are read.
-        loss: the `LossConfig` of a run, and what the loss learnt, for `load_loss`. The model and
-            its digest do not depend on it.
-        restriction: notice of a licence that forbids commerce, which is said at load.
+        half: whether to store float32 parameters as float16, in half the space. They are rounded,
+            and become float32 again when they are read.
+        loss: the `LossConfig` of a run, and the loss's learnt parameters, for `load_loss`. The
+            model and its digest do not depend on it.
+        restriction: notice of a licence that forbids commercial use, which is shown at load.
 
     Raises:
-        InputError: parameters that `load_weights` would refuse; the folder cannot be made, or the
-            file not be written.
+        InputError: `load_weights` would reject the parameters; the folder cannot be made, or the
+            file cannot be written.
 
     Example:
         >>> import jax, tempfile
@@ -140,7 +140,7 @@ def _halved(leaf: Any) -> np.ndarray:
     array = np.asarray(leaf)
     if array.dtype != np.float32:
         return array
-    with np.errstate(over="ignore"):  # infinity is told of as such
+    with np.errstate(over="ignore"):  # infinity is reported as such
         return array.astype(np.float16)
 
 
@@ -149,22 +149,22 @@ def load_weights(
 ) -> Model:
     """Read the model that `save_weights` wrote.
 
-    A note tells if a part's source has changed since the weights were written.
+    A note warns if a part's source has changed since the weights were written.
 
     Args:
-        path: the file; `find_weights` returns that of a name.
+        path: the file; `find_weights` finds the file of a name.
         expected: if given, the configuration that the file must have, except for what parameters
             do not depend on: image size (but MixVPR's do), dropout, compute type, remat.
-        verify: whether to check that the file's bytes are those that were written.
+        verify: whether to check the file against its checksum.
 
     Returns:
         The model.
 
     Raises:
-        InputError: the file is missing, changed, cut short or no such file; it needs a part that is
-            not registered; its parameters do not fit its configuration or are not finite (the first
-            that are missing, unknown or wrong are listed); its configuration is not `expected` (all
-            fields that differ are listed).
+        InputError: the file is missing, changed, truncated or not a weight file; it needs a part
+            that is not registered; its parameters do not fit its configuration or are not finite
+            (the first that are missing, unknown or wrong are listed); its configuration is not
+            `expected` (all fields that differ are listed).
 
     Example:
         >>> load_weights("none.safetensors")
@@ -184,7 +184,7 @@ def load_weights(
 
 
 def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
-    """Read all that `save_weights` wrote; see `load_weights`.
+    """Read everything that `save_weights` wrote; see `load_weights`.
 
     Raises:
         InputError: what `load_weights` raises.
@@ -220,9 +220,9 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
 
 
 def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None:
-    """Check that a configuration may be that of some arrays.
+    """Check that a configuration is plausible for some arrays.
 
-    Before anything is made of it: a file may claim any sizes.
+    This comes before anything is made from it: a file may claim any sizes.
 
     Args:
         plain: the configuration, as JSON values.
@@ -230,7 +230,7 @@ def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None
         source: the file, for messages.
 
     Raises:
-        InputError: it has many more layers, or far larger ones.
+        InputError: the configuration has many more layers, or far larger ones.
     """
     text = json.dumps(plain)
     layers = sum(map(int, re.findall(r'"layers": (\d+)', text)))
@@ -243,7 +243,7 @@ def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None
 
 
 def model_hash(params: Crisalad, config: ModelConfig) -> str:
-    """Compute a digest of all that determines descriptors, besides image size and rounding.
+    """Compute a digest of all that determines descriptors, except image size and rounding.
 
     The digest covers the parameters' names, types, shapes and values. It also covers the
     configuration's fields that outputs depend on, if they differ from their defaults. It is the

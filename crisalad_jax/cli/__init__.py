@@ -31,16 +31,16 @@ from crisalad_jax.utils.version import VERSION
 _COMMANDS: dict[str, dict[str, str]] = tomllib.loads(
     pathlib.Path(__file__).with_name("commands.toml").read_text(encoding="utf-8")
 )
-"""What the help says of each command, of which commands.toml is the table.
+"""Help of each command, from commands.toml.
 
 Each command is a module here, whose function `run` takes the parsed flags, and may return what
---json writes or prints. It may also have `needs_jax(flags)`; where that is false, and JAX computes
+--json writes or prints. It may also have `needs_jax(flags)`; if that is false, and JAX computes
 after all, the command calls `common.Jax.set_up`.
 """
 
 
 def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
-    """Parse the flags into an instance of a command's class; tyro's complaints become one line."""
+    """Parse the flags into an instance of a command's class; tyro's errors become one line."""
     import tyro
 
     from crisalad_jax.cli import help as helping
@@ -106,7 +106,7 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
         arguments = module.prepare(arguments)
     chosen = _parse(name, module, arguments)
     for flag, number in _numbers("", chosen):
-        # Arrays take no larger one, and no count or size comes near.
+        # Arrays take no larger number, and no count or size comes near it.
         require(
             abs(number) <= 2**40, f"--{flag}: found {number}, expected a number of at most 2**40"
         )
@@ -136,11 +136,11 @@ def _numbers(flag: str, value: Any) -> Iterator[tuple[str, int]]:
 def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False) -> int:
     """Run one command, and return its exit code.
 
-    A process of its own may `keep_programs` (`utils.executable_cache`): nothing else changes the
-    code there.
+    A dedicated process may `keep_programs` (`utils.executable_cache`), because nothing else changes
+    the code there.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if given[:1] == ["help"]:  # as of git
+    if given[:1] == ["help"]:  # as in git
         given = [*given[1:], "--help"]
     if not given or given[0] in ("-h", "--help"):
         print(_usage(), file=sys.stdout if given else sys.stderr)
@@ -172,7 +172,7 @@ def _exit_code(given: list[str], keep_programs: bool) -> int:
 
 
 def _check_command(name: str) -> None:
-    """Raise InputError where there is no such command, with those of a like name, or else all."""
+    """Raise InputError if there is no such command, with those of a similar name, or else all."""
     near = difflib.get_close_matches(name, _COMMANDS)
     words = f"did you mean {' or '.join(near)}?" if near else f"expected {', '.join(_COMMANDS)}"
     require(name in _COMMANDS, f"found no command {name!r}; {words} (see crisalad --help)")
@@ -183,7 +183,7 @@ _WORDS_OF_MEMORY = (
     *("failed to map segment", "can't start new thread", "Unable to allocate"),
     "error return without exception set",
 )
-"""What XLA, OpenCV, C++, the system, its linker, Python's threads, numpy and code in C say."""
+"""Out-of-memory errors of XLA, OpenCV, C++, the system, its linker, threads, numpy and C code."""
 
 
 def _reason(error: BaseException, name: str) -> str | None:

@@ -18,7 +18,7 @@ class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     map: pathlib.Path
     """Map whose model is adapted; its images must be where they were indexed."""
     out: Annotated[pathlib.Path, FOLDER]
-    """Folder for adapted.safetensors, the run and what was measured."""
+    """Folder for adapted.safetensors, the run and the measurements."""
     settings: Any
     weights: pathlib.Path | None = None
     """Weights that made the map, if they were moved since."""
@@ -26,15 +26,14 @@ class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     """More images of the place to train on, such as those of another day; they don't join the
     map."""
     place_radius: float | None = None
-    """Metres from a place's centre, within which its images are, for a map with positions; by
-    default 10."""
+    """Radius in metres around a place's centre, for a map with positions; by default 10."""
     place_frames: int | None = None
-    """Number of consecutive images that are a place, for a map without positions; by default each
-    image is one, seen under two augmentations."""
+    """Number of consecutive images in a place, for a map without positions; by default each image
+    is one, seen under two augmentations."""
     watch: tuple[pathlib.Path, ...] = ()
     """Evaluation sets of other places, whose recall is compared before and after."""
     most_lost: float = 0.005
-    """Most that Recall@1 of a watched set may fall, as a fraction; else the map is not replaced."""
+    """Largest drop in Recall@1 of a watched set, as a fraction, that allows replacing the map."""
     replace: bool = False
     """Rebuild the map with the adapted model; the old map stays until the new one is complete."""
 
@@ -59,7 +58,7 @@ def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
 
 
 def run(arguments: Adapt) -> dict[str, Any]:
-    """Adapt the model, and print what was gained."""
+    """Adapt the model, and print the gain."""
     from crisalad_jax.experiments.adapt import adapt, to_json
 
     config: TrainConfig = arguments.settings

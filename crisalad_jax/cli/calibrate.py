@@ -15,25 +15,25 @@ from crisalad_jax.retrieval.verification.verify import Verify
 
 
 class Calibrate(ReadFlags, SetFlags, MapFlags, TableFlags):
-    """Measure from which similarity on a map's answers are right, and let the map remember it.
+    """Measure the similarity from which a map's answers are correct, and store it in the map.
 
-    Every image is described independently, at the map's size, by the map's model. The database of
-    the set should be the map's places, or about as many like them, and its queries what the map
-    will be asked, unknown places among them. `crisalad query` then answers "unknown" to images
+    Every image is described independently, at the map's size, by the map's model. The set's
+    database should be the map's places, or about as many like them, and its queries like those that
+    the map will get, including unknown places. `crisalad query` then answers "unknown" to images
     below that similarity. An earlier calibration is replaced.
     """
 
     precision: float = 0.99
-    """Share of the answers that must be right."""
+    """Share of the answers that must be correct."""
     verify: int | None = None
-    """Measure how many inliers the best of so many verified answers must have, in place of a
-    similarity (docs/verification.md); remembered apart, for `crisalad query --verify`."""
+    """Verify this many answers, and measure how many inliers the best needs, not which similarity
+    (docs/verification.md); stored separately, for `crisalad query --verify`."""
     matcher: pathlib.Path | None = None
     """ONNX file of the matcher that verifies; by default SIFT."""
 
 
 def run(arguments: Calibrate) -> dict[str, Any]:
-    """Calibrate the map, and print what it remembers."""
+    """Calibrate the map, and print what is stored in it."""
     refuse_without("--verify", arguments.verify, matcher=arguments.matcher)
     verify = None
     if arguments.verify is not None:

@@ -1,4 +1,4 @@
-"""Helpers of several commands: the terminal, and loading a model as their flags name it."""
+"""Helpers of several commands: terminal output, and loading the model that flags name."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.training.loop import FitResult
 
 _WIDE = 10_000
-"""Columns that no table fills."""
+"""A number of columns that no table fills."""
 # A file or a pipe has room for all columns. Brackets and colons in names are text.
 console = rich.console.Console(
     width=None if sys.stdout.isatty() else _WIDE, markup=False, emoji=False
@@ -48,9 +48,9 @@ def echo(line: str) -> None:
 
 
 def show(table: rich.table.Table) -> None:
-    """Print a table so that nothing in it breaks; a wide one in parts, each with the first column.
+    """Print a table without wrapping; a wide one in parts, each with the first column.
 
-    A terminal has no room for a column that is wider than itself, and breaks its lines.
+    The terminal still breaks the lines of a column that is wider than itself.
     """
     if table.title:
         echo(str(table.title))
@@ -74,7 +74,7 @@ def _parts(table: rich.table.Table) -> Iterator[rich.table.Table]:
 def _part(
     table: rich.table.Table, columns: Sequence[rich.table.Column]
 ) -> tuple[rich.table.Table, int]:
-    """Make a table of some columns that breaks no line, and return its width too."""
+    """Make a table of some columns without wrapping, and return its width too."""
     part = rich.table.Table(show_lines=table.show_lines)
     for column in columns:
         part.add_column(column.header, justify=column.justify, no_wrap=True)
@@ -85,17 +85,17 @@ def _part(
 
 
 STDOUT = pathlib.Path("-")
-"""Name of the terminal, or of what reads the output, in place of a file of JSON or LaTeX."""
+"""Name of the standard output, in place of a file of JSON or LaTeX."""
 
 
 def prepare_output(flags: Any) -> None:
-    """Check all that a command will write before any work.
+    """Check everything that a command will write, before any work.
 
-    Where --json or --latex is `STDOUT`, print all else on stderr.
+    If --json or --latex is `STDOUT`, print everything else on stderr.
 
     Raises:
-        InputError: a file or folder cannot be made, its name says another format, or both of these
-            are to be printed.
+        InputError: a file or folder cannot be made, its suffix is of another format, or both of
+            these flags are to be printed.
     """
     printed = [name for name in ("json", "latex") if getattr(flags, name, None) == STDOUT]
     require(len(printed) < 2, "--latex: found - with --json -, expected only one of the two")
@@ -111,7 +111,7 @@ def prepare_output(flags: Any) -> None:
 
 
 class Jax:
-    """What a command sets up before JAX computes."""
+    """The set-up of a command before JAX computes."""
 
     keeps_programs: ClassVar[bool] = False
     """Whether compiled programs are stored; see `executable_cache.cache_executables`."""
@@ -127,7 +127,7 @@ class Jax:
 
 
 def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
-    """Write a command's result as JSON, or print it where the file is `STDOUT`; None does neither.
+    """Write a command's result as JSON, or print it if the file is `STDOUT`; None does neither.
 
     Raises:
         InputError: the file cannot be written.
@@ -139,14 +139,14 @@ def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
 
 
 def show_tables(*tables: Table, latex: pathlib.Path | None = None) -> None:
-    """Print tables, and write them as LaTeX where that is asked for."""
+    """Print tables, and write them as LaTeX if asked for."""
     for table in tables:
         show(table.terminal())
     emit_latex(latex, *tables)
 
 
 def emit_latex(file: pathlib.Path | None, *tables: Table) -> None:
-    """Write tables as LaTeX, or print them where the file is `STDOUT`; None does neither.
+    """Write tables as LaTeX, or print them if the file is `STDOUT`; None does neither.
 
     Raises:
         InputError: the file cannot be written.
@@ -159,7 +159,7 @@ def emit_latex(file: pathlib.Path | None, *tables: Table) -> None:
 
 
 def first_of(names: Sequence[str]) -> str:
-    """Say which is the first of names of which a message has the number."""
+    """Quote the first of some names, for a message that has their number."""
     return f"{names[0]!r} the first" if names else ""
 
 
@@ -169,13 +169,13 @@ def pick(flags: Any, *names: str) -> dict[str, Any]:
 
 
 def refuse_with(flag: str, **others: Any) -> None:
-    """Raise InputError where one of the other flags, which exclude `flag`, has a value."""
+    """Raise InputError if one of the other flags, which exclude `flag`, has a value."""
     for name in _given(others):
         raise InputError(f"{name}: found with {flag}, expected only one of the two")
 
 
 def refuse_without(flag: str, value: Any, **others: Any) -> None:
-    """Raise InputError where one of the other flags has a value, and `flag`, which it needs, none.
+    """Raise InputError if one of the other flags has a value, but not `flag`, which it needs.
 
     Args:
         flag: its name.
@@ -196,7 +196,7 @@ def _given(flags: Mapping[str, Any]) -> list[str]:
 
 
 def fit_words(result: "FitResult", config: "TrainConfig") -> str:
-    """Say how a run ended: its steps, its best recall, the images that it skipped."""
+    """Describe how a run ended: its steps, its best recall, the images that it skipped."""
     words = [f"{result.steps} steps"]
     if result.stopped_early:
         words.append("stopped early")
@@ -210,9 +210,9 @@ def fit_words(result: "FitResult", config: "TrainConfig") -> str:
 def find_given(
     weights: pathlib.Path | None, *, runtime: QueryRuntimeName = "jax", quiet: bool = False
 ) -> pathlib.Path | None:
-    """Return the file that an optional flag means, as `find_weights` does; None where not given.
+    """Return the file that an optional flag names, as `find_weights` does; None if not given.
 
-    For another runtime a folder is an exported model.
+    For another runtime, a folder is an exported model.
     """
     return None if weights is None else find_weights(weights, engine=runtime, quiet=quiet)
 
@@ -233,7 +233,7 @@ def given_positions(flags: PositionFlags) -> "Track | pathlib.Path | None":
 
 
 def open_set(flags: Any) -> "Benchmark":
-    """Open the evaluation set that `SetFlags` and `ReadFlags` name, and say what it is.
+    """Open the evaluation set that `SetFlags` and `ReadFlags` name, and print what it is.
 
     Raises:
         InputError: what `open_benchmark` raises.
@@ -250,7 +250,7 @@ def open_set(flags: Any) -> "Benchmark":
 
 
 def load_model(weights: pathlib.Path, flags: SizeFlags, *, quiet: bool = False) -> "Model":
-    """Load a model of JAX's by its file or name, changed by flags.
+    """Load a JAX model by its file or name, changed by flags.
 
     Raises:
         InputError: what `load_weights` and `ModelConfig.resized` raise.

@@ -18,25 +18,25 @@ class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     """Folder of the comparison; the same command resumes what is in it. It also gets table.md,
     table.csv, results.json, and the page index.html."""
     train: pathlib.Path | None = None
-    """Training set: a folder with one folder a place, a table name,place[,lat,lon[,heading]]
+    """Training set: a folder with one folder per place, a table name,place[,lat,lon[,heading]]
     (places.csv in the folder, or the file), or Dataframes/ and Images/ of GSV-Cities."""
     backbone: pathlib.Path | None = None
     """Train from this backbone, as the recipes say: a file of this package, a public checkpoint, or
-    a published model's name. None trains all from nothing, by the recipe scratch."""
+    a published model's name. None trains all from scratch, by the recipe scratch."""
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14."""
     seeds: int = 3
-    """Runs of each, of seed 0, 1 and so on."""
+    """Runs of each, with seeds 0, 1 and so on."""
     epochs: int | None = None
-    """By default the recipes'; from nothing 6."""
+    """By default the recipes'; from scratch 6."""
     grouping: str = "single"
     """Comma-separated, as `evaluate` takes them, for methods with a cross-image encoder."""
     reference: str | None = None
-    """Which line differences, speeds and training times are relative to; by default crisalad, or
-    the first where that is not compared."""
+    """Row that differences, speeds and training times are relative to; by default crisalad, or the
+    first if that is not compared."""
     jobs: int | None = None
-    """Runs at once, each a task of Ray (extra ray) with its share of the devices; without --cluster
-    on this machine. By default 1; on a cluster one for each GPU, or for each node without any."""
+    """Parallel runs, each a Ray task (extra ray) with its share of the devices; without --cluster
+    on this machine. By default 1; on a cluster one per GPU, or per node if there is none."""
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
@@ -53,13 +53,13 @@ def run_comparison(
     names: tuple[str, ...],
     **more: Any,
 ) -> dict[str, Any]:
-    """Carry out a comparison, and print its tables.
+    """Run a comparison, and print its tables.
 
     Args:
-        flags: of both commands.
+        flags: the flags of both commands.
         command: "compare" or "ablate".
         names: what is compared.
-        **more: the settings of the `ComparisonConfig` that one command alone has.
+        **more: settings of the `ComparisonConfig` that only one command has.
 
     Returns:
         The result as JSON values.
@@ -93,7 +93,7 @@ def run_comparison(
 
 
 class Compare(ComparisonFlags):
-    """Train or load the methods of the paper's Table 1, evaluate them alike, and table that."""
+    """Train or load the paper's Table 1 methods, evaluate them the same way, and print tables."""
 
     methods: str | None = None
     """Comma-separated. By default the models of --weights; if there are none, or if they replace
@@ -102,12 +102,11 @@ class Compare(ComparisonFlags):
     eigenplaces-vit, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is a method too,
     and so is RECIPE+PART, with a registered part as NAME or KIND:NAME."""
     weights: tuple[str, ...] = ()
-    """NAME=FILE or the NAME of a published model (`crisalad models`). If NAME is a method's, the
-    weights are that method's, which is not trained. Any other name is a line of its own, whatever
-    model the file holds; + and a second stage after it, as in fol-large+fol, ranks the first
-    retrievals again."""
+    """NAME=FILE or the NAME of a published model (`crisalad models`). If NAME is a method, it uses
+    these weights and is not trained. Any other name is a row of its own, whatever model the file
+    holds; + and a second stage after it, as in fol-large+fol, re-ranks the first retrievals."""
     rerank: int = 20
-    """How many first retrievals a second stage ranks again."""
+    """Number of retrievals that a second stage re-ranks."""
 
 
 def run(arguments: Compare) -> dict[str, Any]:

@@ -28,10 +28,10 @@ def run(arguments: Completion) -> None:
 
 
 def completion_script(shell: Shell) -> str:
-    """Write the script, which starts no Python: all that it completes stands in it.
+    """Write the script, which starts no Python: it contains everything that it completes.
 
-    Of a configuration it knows the flags of the default parts. A command whose extra is not
-    installed is completed by its name alone.
+    For a configuration it knows the flags of the default parts. If the extra of a command is not
+    installed, only the command's name is completed.
     """
     import shtab
 
@@ -73,7 +73,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
 def _models_and_files() -> dict[str, Any]:
     """Return how each shell completes weights: by the names of models, and by files."""
     names = " ".join((starter.NAME, *PUBLISHED))
-    function = "_crisalad_models_and_files"  # of shtab's own names, bash takes _file as of files
+    function = "_crisalad_models_and_files"  # shtab's bash looks for _file in it
     return {
         "bash": function,
         "zsh": function,

@@ -31,7 +31,7 @@ class Convert(PluginFlag, JsonFlag):
     format: Annotated[str | None, tyro.conf.arg(help=_FORMATS)] = None
     backbone: pathlib.Path | None = None
     """The backbone's checkpoint, or a published model's name, as in dinov2-vitg14: for a vocabulary
-    of AnyLoc, which is one tensor by itself."""
+    of AnyLoc, which is a single tensor."""
     layer: int | None = None
     """With --backbone: the vocabulary's block, from 0, or from the end where negative; by default
     -9, which is 31 of ViT-g's 40."""
@@ -40,8 +40,8 @@ class Convert(PluginFlag, JsonFlag):
     assignment: str | None = None
     """With --backbone: cosine, as published, or euclidean."""
     half: bool = False
-    """Write a file of this package in half precision, in half the room; of a source of this package
-    too."""
+    """Write a file of this package in half precision, in half the space; also from a source of this
+    package."""
 
 
 def run(arguments: Convert) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from crisalad_jax.utils.errors import few
 
 
 class Data(TableFlags, QuietFlag):
-    """List public data sets, download one, or say what a folder is and whether it is whole."""
+    """List public data sets, download one, or check what a folder is and whether it is complete."""
 
     action: Annotated[
         tyro.conf.Positional[Literal["list", "fetch", "check"]],
@@ -35,7 +35,7 @@ class Data(TableFlags, QuietFlag):
     set: str | None = None
     """With check: name of the set that the folder should be; by default any."""
     read: bool = True
-    """With check: decode all images; --no-read counts them only."""
+    """With check: decode all images; --no-read only counts them."""
 
 
 def run(arguments: Data) -> dict[str, Any] | None:
@@ -67,7 +67,7 @@ def _list(arguments: Data) -> dict[str, Any]:
 
 
 def _show_facts(published: PublishedSet, folder: str) -> None:
-    """Print what is known of a set, and the steps by hand."""
+    """Print what is known about a set, and the steps by hand."""
     facts = {
         "set": published.title,
         "page": published.page,
@@ -103,10 +103,10 @@ def _fetch(published: PublishedSet, arguments: Data) -> dict[str, Any]:
 
 
 def _check(folder: pathlib.Path, expected: str | None, arguments: Data) -> dict[str, Any]:
-    """Print what a folder is.
+    """Print which set a folder is.
 
     Raises:
-        InputError: it is not as published, or not whole.
+        InputError: it is not as published, or not complete.
     """
     checked = check_set(folder, expected, read=arguments.read, quiet=arguments.quiet)
     show_tables(checked_table(checked.parts), latex=arguments.latex)

@@ -14,7 +14,7 @@ class Demo(TableFlags, QuietFlag):
     out: Annotated[pathlib.Path, FOLDER] = pathlib.Path("demo")
     """Folder for the city, the run, the tables and the pictures."""
     seed: int = 0
-    """Draws the city and the run."""
+    """Seed of the city and the run."""
 
 
 def run(arguments: Demo) -> dict[str, Any]:

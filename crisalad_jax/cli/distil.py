@@ -39,7 +39,7 @@ class Distil(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     val: pathlib.Path | None = None
     """Evaluation set for early stopping, in any layout that `evaluate` reads."""
     val_images: pathlib.Path | None = None
-    """Folder of the images that a .mat file or .npy lists at --val name; by default beside them."""
+    """Folder of images that a .mat file or .npy lists at --val name; by default next to them."""
     image_size: tuple[int, int] | None = None
     """Image height and width of the student; replaces --model.image-size."""
     callback: tuple[str, ...] = ()

@@ -33,44 +33,44 @@ from crisalad_jax.utils.locks import staged_folder
 
 
 class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
-    """Print what a model recalls of an evaluation set under each grouping, and what these leak."""
+    """Print a model's recall on an evaluation set under each grouping, and how much each leaks."""
 
     preset: str | None = None
-    """Evaluate an untrained model of this size in place of weights: tiny, s14, b14, l14 or g14."""
+    """Evaluate an untrained model of this size instead of weights: tiny, s14, b14, l14 or g14."""
     grouping: str = ",".join(DEFAULT_GROUPINGS)
     """Comma-separated: single, shuffled, sequential, masked (sequential, but no image sees another
     of its own place), window (an image with those just before it, --batch-size in all);
-    QUERIES/DATABASE groups the two sides apart, and @26 after it makes batches of 26.
+    QUERIES/DATABASE groups the sides separately, and @26 after it makes batches of 26.
     published:sage, published:cricavpr or published:crisalad: the batches of that evaluation, and
     then the honest ones."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     dtype: Literal["float32", "bits"] = "float32"
-    """What descriptors are compared as: bits are their signs, by the Hamming distance
+    """How descriptors are compared: bits are their signs, by the Hamming distance
     (docs/maps.md)."""
     rerank: str | None = None
-    """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad,
-    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD; fol, pair-vpr, selavpr,
-    selavprpp or transvpr, of one of that method; sinkhorn-divergence, of any local tokens
-    (docs/methods.md); local, by SIFT features (docs/verification.md). Adds a row to each of the
+    """NAME:TOPK re-ranks the first TOPK retrievals by local features: patch-netvlad,
+    patch-netvlad-ransac or patch-netvlad-sum, with a NetVLAD model; fol, pair-vpr, selavpr,
+    selavprpp or transvpr, with a model of that method; sinkhorn-divergence, with any local tokens
+    (docs/methods.md); local, with SIFT (docs/verification.md). Adds a row for each row of the
     table."""
     rerank_weights: pathlib.Path | None = None
     """Model that makes these features, as --weights; by default the first stage's. For local, a
     matcher as an ONNX file."""
     precision: float | None = None
-    """Also print the similarity to ask for so that this share of the accepted first retrievals is
-    right, such as 0.99, and the recall that is left."""
+    """Also print the least similarity at which this share of the accepted first retrievals is
+    correct, such as 0.99, and the remaining recall."""
     seed: int = 0
-    """Draws the first shuffled order, and untrained weights."""
+    """Seed of the first shuffled order and untrained weights."""
     seeds: int = 3
-    """Shuffled orders: their mean and standard deviation are printed."""
+    """Shuffled orders, whose mean and standard deviation are shown."""
     out: Annotated[pathlib.Path | None, FOLDER] = None
     """Folder for a gallery of retrievals and the resolved configuration."""
     report: Annotated[pathlib.Path | None, FOLDER] = None
     """Folder for a page of all results, index.html, that needs no other file and no network; and
     its pictures."""
     rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
-    """Recording for the viewer Rerun: queries, retrievals and similarities, right ones in green."""
+    """Recording for the viewer Rerun: queries, retrievals, similarities; correct ones in green."""
 
 
 def run(arguments: Evaluate) -> None:
@@ -141,13 +141,13 @@ def run(arguments: Evaluate) -> None:
 
 
 def _check_flags(arguments: Evaluate) -> None:
-    """Check before any work that flags go together."""
+    """Check before any work that flags fit together."""
     if arguments.weights is not None:
         refuse_with("--weights", preset=arguments.preset)
     if arguments.runtime != "jax":
         refuse_with(f"--runtime {arguments.runtime}", **pick(arguments, "report", "preset"))
     if arguments.rerun is not None:
-        importlib.import_module("crisalad_jax.experiments.rerun_log")  # or its extra is missing
+        importlib.import_module("crisalad_jax.experiments.rerun_log")  # raises without its extra
     refuse_without("--rerank", arguments.rerank, rerank_weights=arguments.rerank_weights)
 
 

@@ -31,17 +31,17 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
     weights_inside: bool = False
     """Store the weights as constants in the program, not in a file next to it."""
     pixels: Literal["bytes", "floats"] | None = None
-    """Bytes, which the program normalises, or floats that already are; by default what the model
+    """Bytes, which the program normalises, or normalised floats; by default what the model
     resizes."""
     for_colmap: bool = False
-    """Of onnx: the inputs and outputs that COLMAP's draft of retrieval by global descriptors reads
+    """For onnx: inputs and outputs that COLMAP's draft of retrieval by global descriptors reads
     (docs/export.md)."""
     int8: pathlib.Path | None = None
-    """Photographs to quantise products with, of onnx or openvino: a folder or another source of
-    some dozens like those to be described, of a video a frame a second. Costs recall
+    """For onnx or openvino: photographs to quantise products with, a folder or other source of a
+    few dozen like those to be described (one a second of a video). Costs recall
     (docs/export.md)."""
     platforms: str | None = None
-    """Of stablehlo, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
+    """For stablehlo, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
 
 
 def run(arguments: Export) -> dict[str, Any]:
@@ -81,7 +81,7 @@ def run(arguments: Export) -> dict[str, Any]:
 
 
 _MOST = 256
-"""Largest number of photographs that products are quantised with: more change nothing."""
+"""Largest number of photographs to quantise with: more make no difference."""
 
 
 def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray":

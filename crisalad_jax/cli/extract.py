@@ -30,7 +30,7 @@ class Extract(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFl
     """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
     all): a cross-image model's descriptors depend on it."""
     seed: int = 0
-    """Draws the shuffled order."""
+    """Seed of the shuffled order."""
     root: pathlib.Path | None = None
     """Folder that names are relative to, by default --images: hloc's folder of all images."""
     pca: pathlib.Path | None = None

@@ -18,10 +18,10 @@ QueryRuntimeName = Literal["auto", "jax", "onnxruntime", "openvino"]
 
 
 class Target(NamedTuple):
-    """Marks a flag that names what a command writes, which is checked before any work."""
+    """Marks a flag that names what a command writes, to check it before any work."""
 
     suffixes: tuple[str, ...] = ()
-    """What the file's name may end with; any, where there are none."""
+    """Suffixes that the file's name may have; empty allows any."""
     check: Callable[[pathlib.Path], None] = check_target
 
 
@@ -73,7 +73,7 @@ class DecodeFlags(PluginFlag, QuietFlag):
     """How large an image may be."""
 
     max_pixels: int = 2**28
-    """Pixels that an image file may have; larger ones are not decoded."""
+    """Most pixels of an image file; larger ones are not decoded."""
     batch_size: int = 16
     """Number of images described together."""
 
@@ -86,7 +86,7 @@ class ReadFlags(DecodeFlags):
 
     @property
     def reading(self) -> "Reading":
-        """The record of these flags that the library takes."""
+        """These flags as the library takes them."""
         from crisalad_jax.data.reading import Reading
 
         return Reading(batch_size=self.batch_size, on_bad_image=self.on_bad_image, quiet=self.quiet)
@@ -104,7 +104,7 @@ class FrameFlags(Flags):
     """Which frames of videos and robot logs are taken."""
 
     fps: float | None = None
-    """Frames a second taken of a video or robot log, by default 1."""
+    """Frames per second from a video or robot log, by default 1."""
     topic: str | None = None
     """Topic of images in a robot log (ROS bag), by default the only one."""
 
@@ -115,12 +115,12 @@ class SizeFlags(Flags):
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's, or the map's."""
     resize: tuple[str, ...] = ()
-    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
+    """Values that replace the model's: fixed, shorter-side, longer-side or native; bilinear,
     bicubic or area; antialias or no-antialias; bytes or floats; round;
     high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
 
     def applied_to(self, config: "ModelConfig") -> "ModelConfig":
-        """Change how a model prepares and computes images to what the flags say."""
+        """Apply these flags to the configuration of a model."""
         return config.resized(self.image_size, self.resize)
 
 
@@ -132,7 +132,7 @@ class ComputeFlags(SizeFlags):
     what bfloat16 gains and loses."""
 
     def applied_to(self, config: "ModelConfig") -> "ModelConfig":
-        """Change how a model prepares and computes images to what the flags say."""
+        """Apply these flags to the configuration of a model."""
         if self.compute_dtype is not None:
             config = dataclasses.replace(config, compute_dtype=self.compute_dtype)
         return super().applied_to(config)
@@ -149,19 +149,19 @@ class ModelFlags(ComputeFlags, QuietFlag):
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""
     checksums: bool = True
-    """Check all files against their checksums; --no-checksums skips that, where they are huge."""
+    """Check all files against their checksums; --no-checksums skips that for huge files."""
 
 
 class MapFlags(Flags):
-    """Which map is asked, and by which model."""
+    """Which map is queried, and with which model."""
 
     map: pathlib.Path
     """Folder that `crisalad index` wrote."""
     weights: pathlib.Path | None = None
-    """The model that made the map, as a file or a published name; by default where it was then."""
+    """The model that made the map, as a file or published name; by default at its recorded path."""
     checksums: bool = True
     """Check the map's descriptors, and an exported model, against their checksums; --no-checksums
-    skips that, where files are huge."""
+    skips that for huge files."""
 
 
 class PositionFlags(Flags):
@@ -187,23 +187,23 @@ class PlaceFlags(PositionFlags):
 
 
 class SetFlags(Flags):
-    """Which evaluation set, and what is a positive."""
+    """Which evaluation set, and what counts as a positive."""
 
     data: pathlib.Path
     """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
     folders; a .mat file of NetVLAD; .npy lists of SALAD."""
     split: str | None = None
-    """train, val or test, where the set has several."""
+    """train, val or test, if the set has several."""
     layout: str | None = None
     """utm, vpr-bench, netvlad, salad, msls, msls-subtask or folders; by default what DATA looks
     like (msls-subtask, the 740 queries of raw MSLS, only by name)."""
     images: pathlib.Path | None = None
     """Folder of the images that a .mat file or .npy lists name; by default where it is."""
     queries: str | None = None
-    """Folder of the queries, where @UTM sets have several: queries_night of SVOX; by default
+    """Folder of the queries, if a @UTM set has several: queries_night of SVOX; by default
     queries."""
     ignore_zones: bool = False
-    """Compare @UTM numbers of all zones as if of one plane, as the public tools do."""
+    """Compare @UTM numbers of all zones as if on one plane, as the public tools do."""
     radius: float | None = None
     """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
     max_heading_difference: float | None = None

@@ -1,6 +1,6 @@
-"""The help of a command: the flags that people use, or all of them.
+"""The help of a command: the common flags, or all of them.
 
-commands.toml names those of `--help`, and has an example.
+commands.toml names the common ones, for `--help`, and has an example.
 """
 
 import argparse
@@ -15,8 +15,8 @@ from crisalad_jax.config.flags import plain_metavar
 
 SHORT, ALL = "--help", "--help-all"
 _WIDTH, _LEAST, _COLUMN = 100, 60, 30
-"""Most and fewest columns of the help, which a narrower terminal wraps, and the most of its flags;
-what is wider has its text on the next line."""
+"""Most and fewest columns of the help, which a narrower terminal wraps, and the most for a flag; a
+wider flag has its text on the next line."""
 _RAGGED = 12
 """Columns that a line may leave empty where a long word follows."""
 _CHOICES = 6
@@ -27,7 +27,7 @@ _ENDS = re.compile(r"[.;](?= )|$")
 
 
 def asked_for(arguments: Sequence[str]) -> str | None:
-    """Return which help arguments ask for, `SHORT` or `ALL`; None where they ask for none."""
+    """Return which help the arguments ask for, `SHORT` or `ALL`; None if they ask for none."""
     if ALL in arguments:
         return ALL
     return SHORT if SHORT in arguments or "-h" in arguments else None
@@ -55,8 +55,8 @@ def short_help(name: str, about: Mapping[str, str], kind: type) -> str:
     """Write the help that fits a screen: usage, summary, common flags and an example.
 
     Args:
-        name: the command's.
-        about: what commands.toml says of it.
+        name: the command's name.
+        about: its entry in commands.toml.
         kind: the class that its flags are parsed into.
     """
     actions = flags_parser(kind, f"crisalad {name}")._actions
@@ -94,7 +94,7 @@ _DEFAULT = re.compile(r"\s*\((?:default: (.*?)|required)\)\s*$", re.DOTALL)
 
 
 def _shorten(action: argparse.Action, width: int) -> None:
-    """Shorten a flag's text to whole clauses of two lines of this width, and its value."""
+    """Shorten a flag's value, and its text to the clauses that fit two lines of this width."""
     text, metavar = action.help or "", str(action.metavar or "")
     default = _DEFAULT.search(text)
     text = " ".join(_DEFAULT.sub("", text).split()).rstrip(".")
@@ -116,4 +116,4 @@ def _shorten(action: argparse.Action, width: int) -> None:
     short = whole[-1] if whole else textwrap.shorten(text, room, placeholder=" ...")
     action.help = short + tail
     if action.nargs not in (0, "?"):
-        action.nargs = None  # the metavar says how many
+        action.nargs = None  # the metavar shows how many

@@ -21,36 +21,36 @@ from crisalad_jax.utils.output import counted
 
 
 class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
-    """Make a map of a folder of images, or append to it those that it lacks.
+    """Make a map from a folder of images, or append the images that it lacks.
 
-    An existing map takes images by the model that made it, at its image size.
+    An existing map uses the model that made it, at its image size.
     """
 
     images: pathlib.Path
     """Folder, file, pattern, list, table, video or robot log (docs/how-to/image-sources.md);
     the map names images by their paths in the folder, subfolders included."""
     out: Annotated[pathlib.Path, FOLDER]
-    """The map's folder. After a kill the same command goes on."""
+    """The map's folder. After a kill the same command resumes."""
     position_topic: str | None = None
     """Topic of positions in a robot log, by default the only NavSatFix, else the only odometry or
     pose; none takes none."""
     novelty: float | None = None
-    """Take an image only if its similarity to the last one taken of its folder or video is not
-    above that, such as 0.9."""
+    """Take an image only if its similarity to the last one taken of its folder or video is at most
+    this, such as 0.9."""
     store: str | None = None
     """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
-    map's, and of a new map files."""
+    map's, and files for a new map."""
     dtype: Literal["float32", "float16", "bits"] | None = None
-    """What files keep descriptors as, by default the map's, and in a new map float32; bits are
-    their signs (docs/maps.md)."""
+    """Type of descriptors in files, by default the map's, or float32 in a new map; bits are their
+    signs (docs/maps.md)."""
     pca: pathlib.Path | None = None
-    """Components of `crisalad pca`, for shorter descriptors; the map keeps a copy, which queries
+    """Components of `crisalad pca`, for shorter descriptors; the map has a copy, which queries
     use."""
     search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None
-    """Build an approximate search, and print what it recalls; exact removes it, and auto chooses by
-    size and memory (docs/large.md). Milvus alone has diskann."""
+    """Build an approximate search, and print its recall; exact removes it, and auto chooses by size
+    and memory (docs/large.md). Only Milvus has diskann."""
     again: bool = False
-    """Add images that `crisalad map remove` removed, too."""
+    """Also add images that `crisalad map remove` removed."""
 
 
 def run(arguments: Index) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def run(arguments: Index) -> dict[str, Any]:
 
 
 def _words(result: Indexed, config: ModelConfig) -> list[str]:
-    """Describe the images' fates in clauses; empty groups are left out."""
+    """Describe what became of the images in clauses; empty groups are left out."""
     metadata, unmatched, unreadable = result.metadata, result.unmatched, result.unreadable
     fates = (
         (result.there, "were there already"),

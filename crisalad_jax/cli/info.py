@@ -13,7 +13,7 @@ from crisalad_jax.training.summary import model_summary, summary_json, summary_l
 
 
 class Info(SizeFlags, PluginFlag, TableFlags):
-    """Print what a model is made of: parameters, what trains, multiply-accumulates an image."""
+    """Print what a model consists of: parameters, which train, multiply-accumulates per image."""
 
     preset: str | None = None
     """tiny, s14, b14 (the default), l14 or g14."""
@@ -24,8 +24,8 @@ class Info(SizeFlags, PluginFlag, TableFlags):
     checksums: bool = False
     """Read all of the map's descriptors, and compare them with their digests."""
     trainable: str | None = None
-    """What trains, as `train` takes it: words such as all or adapters,head, or patterns of names;
-    by default the recipe's, of a file adapters,head, or head where it has no adapter."""
+    """What trains, as in `train`: values such as all or adapters,head, or patterns of names; by
+    default the recipe's, for a file adapters,head, or head if it has no adapter."""
     batch_size: int = 16
     """Images that attend to each other in the cross-image encoder."""
 

@@ -38,7 +38,7 @@ from crisalad_jax.utils.output import counted
 class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     """List what is in a map, remove, replace or move some of its images, or merge maps.
 
-    Each change is there as a whole or not at all, also after a kill (docs/how-to/correct-a-map.md).
+    Each change is atomic, even if the process is killed (docs/how-to/correct-a-map.md).
     """
 
     action: Annotated[
@@ -55,19 +55,18 @@ class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     """Names of images or patterns such as 'monday/*', for list and remove; other maps, for
     merge."""
     names: bool = False
-    """With list: the names of the images, too."""
+    """With list: also the names of the images."""
     addition: int | None = None
-    """With list and remove: only images of this addition, numbered as `list` does: what was added
-    of one folder on one day."""
+    """With list and remove: only images of this addition, numbered as in `list`: what was added
+    from one folder on one day."""
     day: str | None = None
     """With list and remove: only images that were added on this day, as YYYY-MM-DD (UTC)."""
     store: str | None = None
-    """With merge: where a new map's descriptors are, files or milvus:URI as of `crisalad index`."""
+    """With merge: where a new map's descriptors are, files or milvus:URI as in `crisalad index`."""
     images: pathlib.Path | None = None
-    """With replace: where the changed images are, by the same names, as `crisalad index` takes
-    it."""
+    """With replace: where the changed images are, under the same names, as in `crisalad index`."""
     fps: float | None = None
-    """With replace: frames a second taken of a video, by default 1."""
+    """With replace: frames per second from a video, by default 1."""
 
 
 _FLAGS = {
@@ -77,7 +76,7 @@ _FLAGS = {
     "move": ("positions", "start_time", "time_offset"),
     "merge": ("store",),
 }
-"""The flags of each action that not all of them have."""
+"""The flags of each action that not all actions have."""
 
 
 def needs_jax(arguments: Map) -> bool:
@@ -164,7 +163,7 @@ _DONE = {
     "move": ("moved", "have these positions already"),
     "merge": ("added", "were there already"),
 }
-"""Words for images that an action changed, and for those that it had no need to."""
+"""Words for images that an action changed, and for those that it did not need to."""
 
 
 def _words(change: MapChange, action: str) -> list[str]:

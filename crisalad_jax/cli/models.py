@@ -20,7 +20,7 @@ class Models(PluginFlag, TableFlags):
     """List the models that others published, which --weights takes by name, or describe one."""
 
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None
-    """Print all that is known of this one."""
+    """Print all that is known about it."""
 
 
 def run(arguments: Models) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def run(arguments: Models) -> dict[str, Any]:
 
 
 def _facts(model: Published) -> dict[str, Any]:
-    """Return what is known of a model, by name."""
+    """Return what is known about a model, by name."""
     licence = {"licence": model.licence.name, "commercial": model.licence.commercial}
     return dataclasses.asdict(model) | licence | {"cached": is_cached(model)}
 
@@ -59,7 +59,7 @@ _NOTES = {
 
 
 def _own_facts(name: str) -> dict[str, Any]:
-    """Return what is known of a model in this package, in the words for published ones."""
+    """Return what is known about a model in this package, in the form for published ones."""
     params, config = load_weights(starter.FILES[name])
     unsaid = dict.fromkeys(field.name for field in dataclasses.fields(Published))
     return unsaid | {

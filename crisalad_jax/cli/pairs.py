@@ -16,8 +16,8 @@ from crisalad_jax.utils.output import counted
 class Pairs(ReadFlags, JsonFlag):
     """Choose pairs of images to match, for COLMAP and hloc.
 
-    Among the images of --map or of --images, for a reconstruction; or, with both, of --images with
-    those of the map, to localise them.
+    Pairs are among the images of --map or of --images, for a reconstruction; or, with both, of
+    --images with those of the map, to localise them.
     """
 
     map: pathlib.Path | None = None
@@ -25,7 +25,7 @@ class Pairs(ReadFlags, JsonFlag):
     images: pathlib.Path | None = None
     """Folder, file, pattern, list, table or video (docs/how-to/image-sources.md)."""
     out: Annotated[pathlib.Path, Target((".txt",))]
-    """File for a pair a line: two names with a space between them."""
+    """File with a pair per line: two names separated by a space."""
     root: pathlib.Path | None = None
     """Folder that names are relative to, COLMAP's image_path; by default that of the images."""
     k: int = 20
@@ -33,20 +33,20 @@ class Pairs(ReadFlags, JsonFlag):
     min_similarity: float = -1.0
     """Least similarity of these."""
     min_gap: float | None = None
-    """Seconds that these are apart, at least, by the times in their names: loops."""
+    """Least seconds between these, by the times in their names: loops."""
     overlap: int = 0
-    """Each image with so many next ones of its folder or video, too."""
+    """Also each image with this many next ones of its folder or video."""
     within: float | None = None
-    """Images at most so many metres apart, too, where positions are known."""
+    """Also images at most this many metres apart, if positions are known."""
     weights: pathlib.Path | None = None
-    """Describes --images; by default the model that made the map, or starter. A file or a published
+    """Model for --images; by default the one that made the map, or starter. A file or a published
     name."""
     fps: float | None = None
-    """Frames a second taken of a video, by default 1."""
+    """Frames per second from a video, by default 1."""
     runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md)."""
     checksums: bool = True
-    """Check files against their checksums; --no-checksums skips that, where they are huge."""
+    """Check files against their checksums; --no-checksums skips that for huge files."""
 
 
 def needs_jax(arguments: Pairs) -> bool:

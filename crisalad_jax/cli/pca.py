@@ -19,24 +19,23 @@ class Pca(JsonFlag, QuietFlag):
     """Fit principal components to descriptors, for shorter ones (extract, evaluate --pca)."""
 
     descriptors: pathlib.Path
-    """A .npy file, such as `crisalad extract` writes; not of images that are evaluated on."""
+    """A .npy file, such as `crisalad extract` writes; not of evaluation images."""
     out: Annotated[pathlib.Path, WEIGHTS]
     """A .safetensors file: the components, or with --weights a model."""
     weights: str | None = None
     """Make a model of these weights with the components as its last layer."""
     dim: int = 512
-    """Components that are kept."""
+    """Number of components."""
     whiten: bool = False
     """Divide every component by its standard deviation."""
     renormalise: bool = True
     """Make the shorter descriptors unit vectors again."""
     samples: int = SAMPLES
-    """Fit at most so many descriptors, drawn at random."""
+    """Most descriptors to fit, drawn at random."""
     seed: int = 0
-    """Draws them."""
+    """Their seed."""
     checksums: bool = True
-    """Check descriptors against their checksums; --no-checksums skips that, where files are
-    huge."""
+    """Check descriptors against their checksums; --no-checksums skips that for huge files."""
 
 
 def run(arguments: Pca) -> dict[str, Any]:

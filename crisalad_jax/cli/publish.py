@@ -14,7 +14,7 @@ class Publish(JsonFlag, PluginFlag, QuietFlag):
     """Write a run's model with a model card, to a folder or to Hugging Face's hub."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
-    """Folder of the run; its best weights are taken, or else its last."""
+    """Folder of the run; its best weights are used, or else its last."""
     to: str
     """New folder, or hf://OWNER/NAME at the hub (docs/how-to/share-a-model.md)."""
     licence: str

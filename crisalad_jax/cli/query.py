@@ -49,24 +49,24 @@ _COLUMNS = 8
 
 
 class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
-    """Find the images of a map that are most similar to others, and say where they were taken."""
+    """Find the images of a map most similar to the queries, and print where they were taken."""
 
     images: Annotated[
         tuple[pathlib.Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")
     ]
     """Images, or folders of them, patterns, lists, tables, videos or robot logs
     (docs/how-to/image-sources.md).
-    None with --watch and --camera."""
+    None with --watch or --camera."""
     watch: pathlib.Path | None = None
     """Folder: answer the images that appear in it as they appear, a line of JSON each."""
     camera: str | None = None
-    """Number from 0, URL, video or robot log: answer its newest frame, time and again."""
+    """Number from 0, URL, video or robot log: answer its newest frame, repeatedly."""
     rate: float | None = None
-    """How many times as fast as its own pace a file as --camera plays; by default 1."""
+    """Playback speed of a file as --camera, relative to its own; by default 1."""
     fps: float | None = None
-    """Frames a second taken of a video or log, by default 1; the most that --camera answers."""
+    """Frames per second from a video or log, by default 1; the most that --camera answers."""
     window: int = 1
-    """Frames described together, each with those just before it: a moving camera's."""
+    """Frames of a moving camera described together, each with those just before."""
     runtime: QueryRuntimeName = "auto"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md); auto is the fastest
     that is installed and agrees with jax. Weights are exported for it once; --weights may be an
@@ -74,21 +74,21 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     k: int = 5
     """Answers to each query."""
     min_similarity: float | None = None
-    """A query to which no image is that similar is of an unknown place; by default what `crisalad
+    """Similarity of the best answer below which the place is unknown; by default what `crisalad
     calibrate` measured for this map. -1 answers every query."""
     sequence: Literal["bayes", "seqslam"] | None = None
-    """The queries are consecutive frames of one camera: bayes, a filter, weighs those so far;
-    seqslam searches lines through the last ones (docs/maps.md)."""
+    """The queries are consecutive frames of one camera: bayes, a filter, weighs all so far; seqslam
+    searches lines through the last ones (docs/maps.md)."""
     sequence_reach: float | None = None
-    """How many times as fast as the map's camera this one moves, at most; by default 2. Where names
-    say no times or positions, images of the map a frame."""
+    """Largest speed of this camera relative to the map's; by default 2. If names have no times or
+    positions, images of the map per frame."""
     sequence_length: int | None = None
     """Frames that seqslam's lines go through; by default 10."""
     where: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Search only some of the map's images: 'folder=monday, added>=2026-05-01,
     box=west,south,east,north', of which any may be left out; also time>= (docs/maps.md)."""
     exact: bool = False
-    """Search exactly, although the map has an approximate search."""
+    """Search exactly, even if the map has an approximate search."""
     json: Annotated[pathlib.Path | None, Target((".json", ".jsonl"))] = None
     """File for the answers: .jsonl, a line of JSON for each query, or .json, a list; - prints
     lines."""
@@ -96,27 +96,27 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     """File for where the queries were taken, by its suffix: .csv, which --positions takes, or
     .geojson, .gpx or .kml, in degrees."""
     gallery: Annotated[pathlib.Path | None, Target((".png", ".svg", ".pdf"))] = None
-    """PNG, SVG or PDF of up to 24 queries beside up to 8 answers each."""
+    """PNG, SVG or PDF of up to 24 queries with up to 8 answers each."""
     rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
-    """Recording for the viewer Rerun: queries, answers, similarities and the way on the map, along
-    time (docs/how-to/from-a-bag-to-a-relocalising-robot.md)."""
+    """Recording for the viewer Rerun: queries, answers, similarities and path on the map, over time
+    (docs/how-to/from-a-bag-to-a-relocalising-robot.md)."""
     map_images: pathlib.Path | None = None
     """Folder of the map's images, for --gallery, --rerun and --verify, if they were moved."""
     verify: int | None = None
-    """Number of best answers that are verified by local features: matches, inliers and, with
-    --intrinsics, poses (docs/verification.md)."""
+    """Number of best answers to verify by local features: matches, inliers and, with --intrinsics,
+    poses (docs/verification.md)."""
     min_inliers: int | None = None
-    """A query whose best answer has fewer is of an unknown place; by default what `crisalad
+    """Inliers of the best answer below which the place is unknown; by default what `crisalad
     calibrate --verify` measured for this map."""
     matcher: pathlib.Path | None = None
     """ONNX file of features and their matcher, such as ALIKED + LightGlue; by default SIFT."""
     intrinsics: str | None = None
-    """Of the camera: fx,fy,cx,cy, or with ,width,height, or a file: YAML or JSON of ROS's
+    """The camera's fx,fy,cx,cy, or with ,width,height, or a file: YAML or JSON of ROS's
     camera_info."""
     map_intrinsics: str | None = None
-    """Of the camera that took the map's images, if that was another one."""
+    """The same of the camera that took the map's images, if different."""
     map_depth: pathlib.Path | None = None
-    """Folder of PNGs of 16 bits: depth of the map's images in millimetres, under their names."""
+    """Folder of 16-bit PNGs: depth of the map's images in millimetres, under their names."""
 
 
 def needs_jax(arguments: Query) -> bool:
@@ -125,7 +125,7 @@ def needs_jax(arguments: Query) -> bool:
 
 
 def run(arguments: Query) -> None:
-    """Query the map, and print or write its answers, also as images come."""
+    """Query the map, and print or write its answers, also as images arrive."""
     if arguments.watch is not None or arguments.camera is not None:
         _run_live(arguments)
         return
@@ -182,7 +182,7 @@ def run(arguments: Query) -> None:
 
 
 def _check_files(arguments: Query) -> None:
-    """Check that pictures have what they need, and a file of their own."""
+    """Check that output flags fit together, and that their extras are installed."""
     gallery, file, rerun, out = arguments.gallery, arguments.json, arguments.rerun, arguments.out
     require(
         out is None or out.suffix != "",
@@ -192,7 +192,7 @@ def _check_files(arguments: Query) -> None:
         needs = "--gallery, --rerun or --verify"
         refuse_without(needs, gallery or rerun, map_images=arguments.map_images)
     if rerun is not None:
-        importlib.import_module(_RECORDS)  # or its extra is missing
+        importlib.import_module(_RECORDS)  # raises if its extra is missing
     if gallery is None:
         return
     importlib.import_module("crisalad_jax.experiments.report")
@@ -203,7 +203,7 @@ def _check_files(arguments: Query) -> None:
 
 
 def _sequence_of(arguments: Query) -> SequenceSearch | None:
-    """Make the search that the flags ask for; None where they ask for none."""
+    """Make the search that the flags ask for; None if they ask for none."""
     reach, length = arguments.sequence_reach, arguments.sequence_length
     if arguments.sequence == "seqslam":
         refuse_with("--sequence seqslam", sequence_reach=reach)
@@ -223,7 +223,7 @@ def _where_of(arguments: Query) -> Where | None:
 
 
 def _verify_of(arguments: Query) -> Verify | None:
-    """Make what the flags say of verification."""
+    """Make the verification that the flags ask for; None if they ask for none."""
     flags = ("matcher", "intrinsics", "map_intrinsics", "map_depth", "min_inliers")
     given = pick(arguments, *flags)
     if arguments.verify is None:
@@ -255,9 +255,9 @@ def _opened(arguments: Query) -> Iterator[tuple[Map, str]]:
 
 
 def _unknown_words(answers: Answers, places: Map) -> str:
-    """Say how many queries are of unknown places, and what their similarity rests on.
+    """Describe how many queries are of unknown places, and how the threshold was measured.
 
-    Nothing where any similarity counts.
+    It is empty if any similarity counts.
     """
     below = []
     if answers.min_similarity is not None:
@@ -274,8 +274,8 @@ def _unknown_words(answers: Answers, places: Map) -> str:
 def answer_lines(answers: Answers) -> Iterator[str]:
     """Yield the name of each query, and below it its answers; an unknown place has one line.
 
-    Numbers stand in columns, and names at the ends of lines: a name that a terminal has no room for
-    runs on in its next line, and is copied whole.
+    Numbers are in columns, and names at the ends of lines: a name that is too long for a terminal
+    continues on its next line, and is copied in one piece.
     """
     found = list(json_rows(answers))
     position = ", ".join(answers.axes or ("position",))
@@ -313,7 +313,7 @@ def _verified_cells(answer: dict[str, Any], columns: Sequence[str]) -> list[str]
 
 
 def _run_live(arguments: Query) -> None:
-    """Print an answer for each image that comes, until a signal or the end of a video."""
+    """Print an answer for each image as it arrives, until a signal or the end of a video."""
     name = "--camera" if arguments.watch is None else "--watch"
     require(not arguments.images, f"IMAGE: found with {name}, expected only one of the two")
     refuse_with(name, gallery=arguments.gallery, out=arguments.out)
@@ -327,7 +327,7 @@ def _run_live(arguments: Query) -> None:
     _check_files(arguments)
     sequence, where = _sequence_of(arguments), _where_of(arguments)
     with contextlib.ExitStack() as stack:
-        # First, for its errors: loading a model takes seconds.
+        # First, so that its errors come early: loading a model takes seconds.
         if arguments.watch is not None:
             source = FolderWatch(arguments.watch)
             verb = "is" if source.there == 1 else "are"
@@ -347,7 +347,7 @@ def _run_live(arguments: Query) -> None:
             recording = stack.enter_context(_recording(arguments))
 
         def ready() -> None:
-            state.has_work = True  # the summary
+            state.has_work = True  # the summary is still to print
             _log(f"ready, {words}; {by}")
 
         answers = query_live(

@@ -18,7 +18,7 @@ from crisalad_jax.utils.output import counted
 
 
 class Render(JsonFlag, QuietFlag):
-    """Render a world of streets, rooms, country and more: places to train on, others to test."""
+    """Render streets, rooms, countryside and more: places to train on, and others to test."""
 
     out: Annotated[pathlib.Path, FOLDER]
     """Folder for the world: train/ in the layout of GSV-Cities, test/ in that of
@@ -26,24 +26,24 @@ class Render(JsonFlag, QuietFlag):
     scenes: int = WorldConfig.scenes
     """Scenes to train on."""
     stations: int = WorldConfig.stations
-    """Places of a scene, one behind the other: they look alike."""
+    """Places of a scene, one behind another; they look similar."""
     images_per_place: int = WorldConfig.images_per_place
-    """Images of a place, by other weather, light, season, traffic and stands."""
+    """Images of a place; weather, light, season, traffic and viewpoint vary."""
     test_scenes: int = WorldConfig.test_scenes
     """Other scenes, to test on."""
     image_size: tuple[int, int] = WorldConfig.image_size
     """Height and width in pixels."""
     sceneries: tuple[Scenery, ...] = SCENERIES
-    """What places are, in turn."""
+    """Kinds of places, in turn."""
     repaint: float = WorldConfig.repaint
-    """Largest deviation of the log colour of things from image to image."""
+    """Largest deviation of objects' log colour between images."""
     varied: tuple[Variation, ...] = VARIATIONS
-    """What changes between the training images of a place, besides paint. Test images change in all
-    of these."""
+    """What changes between a place's training images, in addition to paint. Test images change in
+    all of these."""
     hard: float = WorldConfig.hard
-    """Share of the images that are taken from far aside, turned, or through a crowd."""
+    """Share of images taken from far to the side, turned, or through a crowd."""
     seed: int = WorldConfig.seed
-    """Draws the world."""
+    """Seed of the world."""
 
 
 def run(arguments: Render) -> dict[str, Any]:

@@ -18,31 +18,31 @@ class Serve(DecodeFlags, MapFlags):
     """Answer over HTTP, and in a browser, where photographs were taken."""
 
     host: str = "127.0.0.1"
-    """Name or address to listen at; others than this machine's own need a token."""
+    """Name or address to listen on; others than this machine's own need a token."""
     port: int = 8000
-    """Port to listen at; 0 is any that is free."""
+    """Port to listen on; 0 is any free one."""
     token_file: pathlib.Path | None = None
-    """File of the token that requests have to bring; by default the variable CRISALAD_TOKEN."""
+    """File of the token that requests must send; by default the variable CRISALAD_TOKEN."""
     append: bool = False
     """Let requests add images to the map; no other process can append meanwhile."""
     map_images: pathlib.Path | None = None
-    """Folder of the map's pictures, if they are not where they were."""
+    """Folder of the map's pictures, if they were moved."""
     runtime: QueryRuntimeName = "auto"
     """What computes the model; see `crisalad query`."""
     k: int = 5
-    """Answers to a picture, where the request names no number."""
+    """Answers to a picture, if the request gives no number."""
     tiles: str | None = None
     """Address of a street map behind the page's map, which browsers then ask for the tiles:
     https://tile.openstreetmap.org/{z}/{x}/{y}.png."""
     tiles_attribution: str | None = None
-    """Words to show with the tiles; by default what OpenStreetMap asks for, of its own."""
+    """Text to show with the tiles; by default OpenStreetMap's, for its own."""
     rerank: str | None = None
     """local:N verifies the N best answers by local features; local, the first 5
     (docs/verification.md)."""
     max_bytes: int = 20 * 2**20
-    """Bytes that a request may have."""
+    """Most bytes of a request."""
     max_pixels: int = 2**26
-    """Pixels that a picture may have; larger ones are not decoded."""
+    """Most pixels of a picture; larger ones are not decoded."""
 
 
 def run(arguments: Serve) -> None:

@@ -13,7 +13,7 @@ from crisalad_jax.utils.output import printable
 
 
 def summary_table(summary: ModelSummary, name: str) -> Table:
-    """Make a table of a model's parts; `name` is the model's."""
+    """Make a table of a model's parts; `name` is the model's name."""
     height, width = summary.image_size
     whole = PartCost("all", *(sum(each) for each in list(zip(*summary.parts, strict=True))[1:]))
     rows = [
@@ -59,7 +59,7 @@ def sets_table(sets: Sequence[PublishedSet]) -> Table:
 
 
 def checked_table(parts: Sequence[CheckedPart]) -> Table:
-    """Make a table of what a folder is, a row for each part."""
+    """Make a table of what a folder contains, with a row for each part."""
     rows = []
     for part in parts:
         counts = [
@@ -78,7 +78,7 @@ def checked_table(parts: Sequence[CheckedPart]) -> Table:
 
 
 _MOST = 10
-"""Most rows of a fact that are listed."""
+"""Most rows to list for a fact."""
 
 
 def fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:

@@ -23,10 +23,10 @@ from crisalad_jax.utils.errors import InputError
 
 
 class Train(JsonFlag, PluginFlag, QuietFlag):
-    """Train on places, each with several images; go on with the run if OUT holds one."""
+    """Train on places, each with several images; resume the run in OUT if there is one."""
 
     data: tuple[pathlib.Path, ...]
-    """Folder with one folder a place, a table name,place[,lat,lon[,heading]] (places.csv in the
+    """Folder with one folder per place, a table name,place[,lat,lon[,heading]] (places.csv in the
     folder, or the file), or Dataframes/ and Images/ of GSV-Cities, here or at an address as in
     s3://bucket/places; for netvlad, patch-netvlad and selavpr, which mine tuples, a training set of
     queries in any layout that `evaluate` reads. Or several sets of places, as NAME=DIR NAME=DIR:
@@ -35,33 +35,33 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     """Folder of the run."""
     settings: Any
     place_radius: float | None = None
-    """Make places of --data, a source of images with positions (docs/how-to/image-sources.md):
-    images within so many metres of a centre are one. Batches have no two that are near."""
+    """Make places from --data, a source of images with positions (docs/how-to/image-sources.md):
+    images within this many metres of a centre. No batch has two nearby places."""
     place_frames: int | None = None
-    """Make a place of every so many images in order, of a folder or video as --data. Batches have
-    no two that are neighbours."""
+    """Make each place from this many consecutive images of --data, a folder or video. No batch has
+    two neighbouring places."""
     positions: pathlib.Path | None = None
     """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for --place-radius; by default
     what a table as --data says, or @UTM names, or EXIF data."""
     fps: float | None = None
-    """Frames a second taken of a video or robot log as --data."""
+    """Frames per second from a video or robot log as --data."""
     topic: str | None = None
     """Topic of images in a robot log as --data, by default the only one."""
     data_images: pathlib.Path | None = None
-    """Folder of the images that a .mat file at --data names; by default beside it."""
+    """Folder of images that a .mat file at --data names; by default next to it."""
     val: pathlib.Path | None = None
     """Evaluation set for early stopping, in any layout that `evaluate` reads."""
     val_images: pathlib.Path | None = None
-    """Folder of the images that a .mat file or .npy lists at --val name; by default beside them."""
+    """Folder of images that a .mat file or .npy lists at --val name; by default next to them."""
     weights: pathlib.Path | None = None
-    """Weights of a whole model to start from: a file, starter, or a published model's name. The run
-    has the file's model, preprocessing and image size, unless flags or --config say otherwise."""
+    """Weights of a model to start from: a file, starter, or a published model's name. The run has
+    the file's model, preprocessing and image size, unless flags or --config say otherwise."""
     backbone: pathlib.Path | None = None
-    """Start from this backbone alone: a file of this package, any checkpoint that `convert` reads,
+    """Start from only this backbone: a file of this package, any checkpoint that `convert` reads,
     or a published model's name, as in dinov2-vitb14."""
     preset: str = "b14"
-    """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from. Of
-    --weights the size is the file's."""
+    """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from. With
+    --weights it is the file's."""
     recipe: str | None = None
     """How it trains. As published: crisalad (the paper; the default), crisalad-1e-4 or
     crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
@@ -70,35 +70,35 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     eigenplaces-turns, netvlad-gsv, cosplace-vit, eigenplaces-vit; sage and megaloc (of several
     sets). From random weights: scratch, the default of tiny. starter: the last run of the model in
     this package, whose --weights are its first run's (docs/starter.md). RECIPE+PART is a recipe
-    with a registered part in place, such as crisalad+gem."""
+    with another registered part, such as crisalad+gem."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28
-    """Pixels that an image file may have; larger ones are not decoded."""
+    """Most pixels of an image file; larger ones are not decoded."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; replaces --model.image-size."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or skip it (masked out of attention and loss, left out of
     validations, and counted)."""
     coordinator_address: str | None = None
-    """In several processes, of one host or many, which each run this command: HOST:PORT of process
-    0, or auto under Slurm, Open MPI or Kubernetes, with a process for each GPU. Process 0 alone
+    """For several processes, on one host or many, which each run this command: HOST:PORT of process
+    0, or auto under Slurm, Open MPI or Kubernetes, with a process for each GPU. Only process 0
     writes into --out."""
     num_processes: int | None = None
     """Number of processes, with --coordinator-address HOST:PORT."""
     process_id: int | None = None
     """Which of them this is, from 0."""
     local_device_ids: tuple[int, ...] | None = None
-    """This host's GPUs that are this process's, with --coordinator-address. By default one: that of
-    the process's number on its host, if Slurm, Open MPI or a coordinator at localhost tells it."""
+    """GPUs of this host for this process, with --coordinator-address. By default one: that of the
+    process's number on its host, if Slurm, Open MPI or a coordinator at localhost gives it."""
     shard_state: bool = False
-    """Keep what trains and its moments in shards, one a device, not whole on each: for --trainable
-    all of a large model."""
+    """Shard the trainable parameters and their moments over the devices: for --trainable all of a
+    large model."""
     cache_gb: float = CACHE_GB
     """Most gigabytes of --data at an address (s3://...) that are cached on this host's disk, in
     CRISALAD_CACHE; processes share it, and 0 caches nothing."""
     callback: tuple[str, ...] = ()
-    """Also write the numbers of steps and validations elsewhere: csv (steps.csv and validations.csv
+    """Also log steps and validations elsewhere: csv (steps.csv and validations.csv
     in OUT), wandb, mlflow, or a registered callback's name."""
     num_threads: int | None = None
     """Threads that read the training images; by default one for each core that this process may
@@ -111,11 +111,11 @@ def parse(program: str, arguments: Sequence[str]) -> Train:
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
-    """Find the file of --weights, whose model says which flags there are, and give that.
+    """Find the file of --weights, whose model determines the flags, and pass it.
 
     Raises:
         InputError: what `find_weights` and `read_model` raise; or several processes would download
-            and convert, which uses JAX before they have met.
+            and convert, which uses JAX before they have joined.
     """
     given = find_flag(arguments, "--weights")
     if given is None or asked_for(arguments):
@@ -128,7 +128,7 @@ def prepare(arguments: Sequence[str]) -> Sequence[str]:
         weights = find_weights(given, quiet="--quiet" in arguments)
         read_model(weights)
     except InputError:
-        if several:  # `train` raises it once all processes have met: the others would wait
+        if several:  # `train` raises it once all processes have joined, or the others would wait
             return arguments
         raise
     return [*arguments, "--weights", str(weights)]
@@ -160,10 +160,10 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
     """Read the configuration that flags start from.
 
     It is that of --config; or of --preset and --recipe, with the model of --weights if there
-    is such a file (`prepare` finds it). Where --data names sets, it is of these.
+    is such a file (`prepare` finds it). If --data names sets, it is a configuration for them.
 
     Raises:
-        InputError: both are given, or one names nothing.
+        InputError: both are given, or one of them does not exist.
     """
     given, data = find_flag(arguments, "--config"), flag_values(arguments, "--data")
     require(len(data) < 2, "--data: found twice, expected all sets after one: NAME=DIR NAME=DIR")

@@ -10,37 +10,37 @@ from crisalad_jax.training.vocabulary import IMAGES, build_vocabulary, start_voc
 
 
 class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
-    """Build AnyLoc's vocabulary from images, or words of SIFT or ORB: a model; or NetVLAD's."""
+    """Build a model's vocabulary from images: AnyLoc's, NetVLAD's, or words of SIFT or ORB."""
 
     images: pathlib.Path
     """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
-    (docs/how-to/image-sources.md). Not of images that are evaluated on."""
+    (docs/how-to/image-sources.md). Not evaluation images."""
     out: Annotated[pathlib.Path, WEIGHTS]
     """A .safetensors file."""
     weights: pathlib.Path | None = None
-    """A model of AnyLoc, NetVLAD or a part of yours with a vocabulary, for another one; a file, or
-    a published model's name."""
+    """A model of AnyLoc, NetVLAD or a custom part with a vocabulary, to replace it; a file, or a
+    published model's name."""
     backbone: pathlib.Path | None = None
-    """Any checkpoint that `convert` reads, or a published model's name, as in dinov2-vitg14: the
-    backbone is taken."""
+    """Any checkpoint that `convert` reads, or a published model's name, as in dinov2-vitg14: its
+    backbone is used."""
     preset: str | None = None
     """tiny, s14, b14 (the default), l14 or g14: the size of --backbone; without one the backbone is
     random."""
     aggregator: str | None = None
     """With --preset: anyloc (the default), or another that starts from centroids, such as netvlad
-    or a part of yours; or sift-vlad, sift-bow or orb-bow, which need no backbone."""
+    or a custom part; or sift-vlad, sift-bow or orb-bow, which need no backbone."""
     clusters: int | None = None
-    """Words, where the aggregator has such a setting; by default the preset's."""
+    """Words, if the aggregator has such a setting; by default the preset's."""
     layer: int | None = None
     """AnyLoc's block, from 0, or from the end where negative; by default the preset's."""
     facet: str | None = None
-    """What of that block AnyLoc takes: query, key, value or token; by default its values."""
+    """What AnyLoc takes from that block: query, key, value or token; by default its values."""
     assignment: str | None = None
-    """What AnyLoc's nearest word of a patch is nearest by: cosine (as published) or euclidean."""
+    """How AnyLoc finds the nearest word of a patch: cosine (as published) or euclidean."""
     max_images: int = IMAGES
-    """Read at most so many images, drawn at random."""
+    """Most images to read, drawn at random."""
     seed: int = 0
-    """Draws the images, patches of each, the first centroids, and a random backbone."""
+    """Seed of the images, patches of each, first centroids and a random backbone."""
 
 
 def run(arguments: Vocabulary) -> dict[str, Any]:

@@ -34,11 +34,11 @@ _PLAIN: Mapping[type, tuple[str, tuple[type, ...]]] = {
     float: ("a number", (int, float, np.integer, np.floating)),
     str: ("text", (str,)),
 }
-"""Words for a plain type, and the types whose values stand for it."""
+"""Description of a plain type, and the types whose values are accepted for it."""
 
 
 def choose(what: str, name: str, choices: Mapping[str, _T]) -> _T:
-    """Look `name` up in `choices`.
+    """Look up `name` in `choices`.
 
     Raises:
         InputError: no such name; the message lists the valid ones.
@@ -65,10 +65,10 @@ def check_seed(what: str, seed: int) -> None:
 
 
 def check_count(what: str, count: Any) -> None:
-    """Check that an argument is a whole number from 1.
+    """Check that an argument is a whole number of at least 1.
 
     Raises:
-        InputError: it is below, or no whole number.
+        InputError: it is less, or not a whole number.
     """
     is_whole = kind_of(int).fits(count)
     expected = "at least 1" if is_whole else "a whole number of at least 1"
@@ -76,14 +76,14 @@ def check_count(what: str, count: Any) -> None:
 
 
 PATH = (str, os.PathLike)
-"""Classes of a file's or a folder's name."""
+"""Classes of a path of a file or folder."""
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
     """Make a decorator that checks the classes of a public function's arguments.
 
-    Two that are swapped are then one line, and not an attribute that something lacks far below.
+    Swapped arguments then give an error of one line, not an AttributeError deep inside a call.
 
     Args:
         **kinds: the class, or the classes, of an argument by its name.
@@ -124,8 +124,8 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
 def check_types(config: Any) -> None:
     """Check that every field of a configuration holds a value of its annotated type.
 
-    NumPy's numbers stand for Python's, and whole numbers for floats. Fields for parts are left to
-    `resolve_names`, and types that configurations do not use are not checked.
+    NumPy's numbers are accepted for Python's, and whole numbers for floats. Fields for parts are
+    left to `resolve_names`, and types that configurations do not use are not checked.
 
     Args:
         config: the configuration, a dataclass that is being made.
@@ -149,14 +149,14 @@ def check_types(config: Any) -> None:
 
 @functools.cache
 def _checked_kinds(config: Any) -> Mapping[str, "Kind"]:
-    """Return what the fields of a configuration's class hold that are for no part."""
+    """Return the kinds of a configuration class's fields, except those for parts."""
     fields = [f.name for f in dataclasses.fields(config) if REGISTRY not in f.metadata]
     hints = get_type_hints(config, include_extras=True)
     return {name: kind_of(hints[name]) for name in fields}
 
 
 class Kind(NamedTuple):
-    """What a type hint says of values."""
+    """The values that a type hint allows."""
 
     fits: Callable[[Any], bool]
     """Returns whether a value is of the type."""
@@ -173,7 +173,7 @@ def limited(least: float, most: float = math.inf) -> Kind:
 # Types of fields whose numbers have a range. To all but `check_types` they are int and float.
 PositiveInt = Annotated[int, Kind(lambda value: value >= 1, "a whole number of at least 1")]
 NonNegativeInt = Annotated[int, Kind(lambda value: value >= 0, "a whole number of at least 0")]
-# JAX drops higher bits, and such a seed would draw the numbers of another one.
+# JAX drops higher bits, so such a seed would draw the same numbers as another one.
 Seed = Annotated[int, Kind(lambda value: 0 <= value < 2**32, "at least 0, and less than 2**32")]
 NonNegativeFloat = Annotated[float, limited(0)]
 Share = Annotated[float, limited(0, 1)]
@@ -187,7 +187,7 @@ Fraction = Annotated[
 
 @functools.cache
 def kind_of(hint: Any) -> Kind:
-    """Return what a type hint says of values."""
+    """Return the values that a type hint allows."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         plain, limited = kind_of(arguments[0]), arguments[1]
@@ -209,14 +209,14 @@ def kind_of(hint: Any) -> Kind:
         )
     if hint in _PLAIN:
         words, classes = _PLAIN[hint]
-        # A bool is an int to Python, and no number of anything.
+        # A bool is an int to Python, but it is not a number of anything.
         return Kind(lambda x: isinstance(x, classes) and (type(x) is bool) <= (hint is bool), words)
     # jaxlib's Array has its module in its name.
     words = (
         "None" if hint is type(None) else getattr(hint, "__name__", str(hint)).rpartition(".")[2]
     )
     kind = origin or hint
-    # Any is a class to `isinstance`, which refuses it.
+    # Any is a class, but `isinstance` rejects it.
     is_class = isinstance(kind, type) and hint is not Any
     return Kind((lambda x: isinstance(x, kind)) if is_class else lambda x: True, words)
 

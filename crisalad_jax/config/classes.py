@@ -1,4 +1,4 @@
-"""Configure how a training set's images are grouped into classes, for losses that classify."""
+"""Configure how a training set's images are grouped into classes, for classification losses."""
 
 import dataclasses
 from typing import Literal
@@ -24,16 +24,16 @@ class ClassesConfig:
     EigenPlaces' cells of position with a focal point. The latter two need real positions."""
     groups: PositiveInt = 8
     """Number of groups, those with the most classes; for viewpoints, the number of lateral groups
-    and again of frontal ones."""
+    and of frontal groups."""
     steps: PositiveInt | None = None
-    """Number of steps of an epoch; None passes once over the largest group."""
+    """Number of steps in an epoch; None passes once over the largest group."""
     cell: PositiveFloat = 10.0
     """Side of a cell in metres, CosPlace's M; EigenPlaces' is 15."""
     sector: PositiveFloat = 30.0
     """Width of a sector of headings in degrees, CosPlace's alpha."""
     spacing: PositiveInt = 5
     """Distance in cells between neighbours of one group, CosPlace's N; EigenPlaces' is 3. Places of
-    one group are as far apart."""
+    one group are that far apart."""
     sector_spacing: PositiveInt = 2
     """Distance in sectors between neighbours of one group, CosPlace's L."""
     focal_distance: PositiveFloat = 10.0

@@ -1,7 +1,6 @@
 """Flags for every field of a configuration, and for those of its parts.
 
-`--model.aggregator gem` puts a registered part in place; `--model.aggregator.FIELD` sets its
-fields.
+`--model.aggregator gem` chooses a registered part; `--model.aggregator.FIELD` sets its fields.
 """
 
 import ast
@@ -28,13 +27,13 @@ _KIND = "_kind"
 def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "") -> Any:
     """Make a stand-in for a configuration, with the same fields and values but without checks.
 
-    tyro gives every field of its class a flag. Parts that the arguments name replace those of the
-    configuration, so that there are flags for their fields.
+    tyro makes a flag for every field of its class. Parts that the arguments name replace those of
+    the configuration, so that there are flags for their fields.
 
     Args:
         config: the configuration.
-        arguments: the command line's.
-        preset: the size of the model, which parts come in.
+        arguments: the command line's arguments.
+        preset: the size of the model, which sets the size of parts.
         path: dotted name of this configuration's own flag.
 
     Raises:
@@ -81,7 +80,7 @@ def _flags_of_each(configs: Sequence[Any], arguments: Sequence[str], preset: str
 
 
 def config_of(flags: Any) -> Any:
-    """Make the configuration from a stand-in of `flags_of` that was parsed.
+    """Make the configuration from a parsed stand-in of `flags_of`.
 
     Raises:
         InputError: what the configuration's own checks raise.
@@ -107,22 +106,22 @@ def flag_values(arguments: Sequence[str], name: str) -> list[list[str]]:
 
 
 def last_values(arguments: Sequence[str], name: str) -> list[str]:
-    """Return the values of the last occurrence of a flag; none where there is none."""
+    """Return the values of the last occurrence of a flag; an empty list if there is none."""
     return (flag_values(arguments, name) or [[]])[-1]
 
 
 def find_flag(arguments: Sequence[str], name: str) -> str | None:
-    """Return the first value of the last occurrence of a flag; None where there is none."""
+    """Return the first value of the last occurrence of a flag; None if there is none."""
     return next(iter(last_values(arguments, name)), None)
 
 
 def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str) -> Any:
-    """Change a configuration by flags, with the checks that a command line meets.
+    """Apply command-line overrides to a configuration, with the checks of a command line.
 
     Args:
-        config: what the flags change.
-        arguments: a command line of flags and values, a truth value as True or False.
-        preset: the size of the model, which parts come in.
+        config: the configuration to change.
+        arguments: flags and values as on a command line; booleans are True or False.
+        preset: the size of the model, which sets the size of parts.
         what: beginning of messages.
 
     Returns:
@@ -144,16 +143,16 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
 
 
 _WIDE = "100000"
-"""Columns that no line of tyro's boxes fills: a narrower one breaks names inside."""
+"""Terminal width that no line of tyro's boxes fills: a narrower one breaks names."""
 
 
 @contextlib.contextmanager
 def refusals(arguments: Sequence[str], *, wide: bool = True) -> Iterator[None]:
-    """Raise what tyro says in a box on standard error, before it ends the program, as InputError.
+    """Raise an InputError for the error that tyro prints in a box before it ends the program.
 
     Args:
-        arguments: the command line's, to find a value's flag.
-        wide: whether nothing but a box is printed in the block: a help fits the terminal.
+        arguments: the command line's arguments, to find the flag of a value.
+        wide: whether the block prints nothing but a box; a help must fit the terminal.
 
     Raises:
         InputError: one line; or the one that a configuration's own check raised.
@@ -186,7 +185,7 @@ _ASIDES = ("Argument help", "Got errors", "For full")
 def _unboxed(box: str) -> list[str]:
     """Extract the texts of tyro's boxes, without frames, help texts and footer."""
     sections = [[]]
-    # The title is dropped. Without UTF-8 on stdout, the frame is of spaces and hyphens.
+    # The title is dropped. Without UTF-8 on stdout, the frame consists of spaces and hyphens.
     for line in box.splitlines()[1:]:
         row = line[2:].rstrip("│ ")
         if not row.strip("─╯-"):
@@ -198,7 +197,7 @@ def _unboxed(box: str) -> list[str]:
 
 
 def plain_metavar(text: str) -> str:
-    """Write what tyro puts in place of a flag's value as we do, without what means no value."""
+    """Rewrite tyro's placeholder for a flag's value in our style, without the None choice."""
     text = text.replace("{None}|", "").replace("{None,", "{")
     text = re.sub(r"\[(\w+) \[\1 \.\.\.\]\]|(\w+) \[\2 \.\.\.\]", r"\1\2...", text)
     return re.sub(r"^\{(\w+ .*|\w+\.\.\.)\}$", r"\1", text)
@@ -208,7 +207,7 @@ _KINDS = {"INT": "whole number", "FLOAT": "number"}
 
 
 def _expected(metavar: str) -> str:
-    """Describe values in words, as far as they are numbers or choices."""
+    """Describe the expected values in words, if they are numbers or choices."""
     parts = plain_metavar(metavar).split()
     kind = _KINDS.get(parts[0].removesuffix("..."))
     if kind is None:
@@ -220,11 +219,11 @@ def _expected(metavar: str) -> str:
 
 
 def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
-    """Say in our words what tyro says; what we do not know stays as it is.
+    """Rewrite tyro's messages in our style; unknown ones stay as they are.
 
     Args:
         texts: the parts of its box.
-        arguments: the command line's.
+        arguments: the command line's arguments.
     """
     said: list[str] = []
     for text in texts:
@@ -247,7 +246,7 @@ def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
         elif found := re.match(r"Missing from .*?: (-.*|[A-Z].*)", text):
             said.append(f"missing {plain_metavar(found[1])}")
         elif found := re.match(r"Unrecognized options: (.*)", text):
-            # Tyro puts commas between them, and none where a flag is missing too.
+            # Tyro puts commas between them, but none if a flag is missing too.
             tokens = [each for each in re.split(", | ", found[1]) if each in arguments]
             said.insert(0, _unknown(tokens, arguments))
         elif found := re.match(r"(?:Perhaps you meant|Arguments similar to \S+): (.*)", text):
@@ -262,7 +261,7 @@ def _or_none(values: str) -> str:
 
 
 def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
-    """Say what is wrong with arguments that tyro does not take: flags, or values too many."""
+    """Describe arguments that tyro does not accept: unknown flags, or too many values."""
     if not tokens:  # with commas or spaces in them
         return "found values without a flag before them"
     flags = [token.partition("=")[0] for token in tokens if token.startswith("-")]
@@ -287,9 +286,9 @@ def parse_settings(
         kind: the command's class, whose subclasses become dataclasses. Its field `settings` takes
             the configuration, and a field `image_size`, if there is one, replaces the model's.
         program: the command's name, for messages.
-        arguments: the command line's.
+        arguments: the command line's arguments.
         defaults: the configuration that flags start from.
-        preset: the size of the model, which parts come in.
+        preset: the size of the model, which sets the size of parts.
 
     Returns:
         An instance of `kind`.

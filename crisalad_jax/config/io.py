@@ -25,7 +25,7 @@ PLUGIN = "plugin"
 def to_plain(config: Any) -> Any:
     """Convert a configuration to nested dictionaries of JSON values, with its parts' names.
 
-    A part of a plug-in also has the plug-in's, so that messages can name it where it is missing.
+    A part of a plug-in also has the plug-in's name, so that messages can name a missing plug-in.
 
     Raises:
         InputError: a value is neither a number, text, nor a list of them.
@@ -55,7 +55,7 @@ def from_plain(kind: type[_T], value: Any, *, source: str) -> _T:
         source: what messages begin with, such as a file's name.
 
     Raises:
-        InputError: naming `source`, and an unknown field, part that is not registered, or value
+        InputError: naming `source`, and an unknown field, a part that is not registered, or a value
             that does not fit.
     """
     with locate_errors(f"{source}: "):
@@ -68,7 +68,7 @@ def _config(kind: Any, value: Any, path: str) -> Any:
         kind, value = _class_and_fields(kind, value)
     hints = typing.get_type_hints(kind)
     given = {
-        # A map's description has a field `config`, as the whole is called.
+        # A map's description has a field `config`, which is also the name of the root.
         name: _value(hints[name], each, path if path == name else f"{path}.{name}")
         for name, each in value.items()
     }
@@ -77,7 +77,7 @@ def _config(kind: Any, value: Any, path: str) -> Any:
 
 
 def _class_and_fields(kind: Any, value: Any) -> tuple[Any, Mapping[str, Any]]:
-    """Return the class of a JSON value, for a part the one with its name, and its fields."""
+    """Return the class of a JSON value (for a part, the one with its name) and its fields."""
     if isinstance(value, str) and issubclass(kind, Part):
         value = {NAME: value}
     if not isinstance(value, Mapping):
@@ -95,7 +95,7 @@ def _class_and_fields(kind: Any, value: Any) -> tuple[Any, Mapping[str, Any]]:
 
 
 def _value(hint: Any, value: Any, path: str) -> Any:
-    """Convert a field's value to exactly its type: 3.7 is no number of epochs."""
+    """Convert a field's value to exactly its type: 3.7 is not a number of epochs."""
     origin, (kind, *_) = typing.get_origin(hint), typing.get_args(hint) or (None,)
     if origin in (typing.Union, types.UnionType):
         # Every union here is of one type and None, or of a part and its name.
@@ -111,7 +111,7 @@ def _value(hint: Any, value: Any, path: str) -> Any:
 
 
 def read_config(kind: type[_T], path: pathlib.Path) -> _T:
-    """Read a configuration that a run wrote, or, without a checksum, that a user wrote.
+    """Read a configuration that a run wrote, or that a user wrote without a checksum.
 
     Args:
         kind: its class.

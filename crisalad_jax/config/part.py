@@ -36,7 +36,7 @@ class Part:
         check_types(self)
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Print what differs, and check fields before the class's own `__post_init__`."""
+        """Add the concise `repr`, and check fields before the class's own `__post_init__`."""
         super().__init_subclass__(**options)
         if "__repr__" not in vars(cls):
             cls.__repr__ = concise_repr  # pyright: ignore[reportAttributeAccessIssue]
@@ -52,7 +52,7 @@ class Part:
         cls.__post_init__ = check_first
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by name: the class of a plain function is nowhere else."""
+        """Pickle by name, because the class made from a plain function cannot be imported."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return _restore, (self.registry.base, self.part_name, fields, type(self).__module__)
 
@@ -67,14 +67,14 @@ P = TypeVar("P", bound=Part)
 if TYPE_CHECKING:
 
     class OrName(Generic[P]):
-        """A field that takes a part or its name, and has the part."""
+        """A field that accepts a part or its name, and holds the part."""
 
         def __get__(self, instance: object, owner: Any = None) -> P:
             """Return the part."""
             ...
 
         def __set__(self, instance: object, value: P | str) -> None:
-            """Take a part or its name."""
+            """Accept a part or its name."""
             ...
 
 else:
@@ -103,7 +103,7 @@ def parts_of(config: Any, prefix: str = "") -> dict[str, Part]:
 def non_semantic_field(default: _T) -> _T:
     """Return a dataclass field that the outputs of given parameters do not depend on.
 
-    Examples are the initialisation, dropout and remat. Files of weights that differ in such fields
+    Examples are the initialisation, dropout and remat. Weight files that differ only in such fields
     hold the same model.
     """
     return dataclasses.field(default=default, metadata={_NON_SEMANTIC: True})
@@ -125,7 +125,7 @@ def with_non_semantic_fields_of(other: Any, config: _T) -> _T:
 def fingerprint_fields(config: Any) -> Any:
     """Return the fields that the outputs depend on, as JSON values, without those at defaults.
 
-    A field that a later version adds therefore changes nothing while it has its default.
+    A field that a later version adds therefore changes nothing while it is at its default.
     """
     if isinstance(config, tuple):
         return [fingerprint_fields(item) for item in config]
@@ -134,7 +134,7 @@ def fingerprint_fields(config: Any) -> Any:
     plain = {NAME: config.part_name} if isinstance(config, Part) else {}
     for field in dataclasses.fields(config):
         value = fingerprint_fields(getattr(config, field.name))
-        # Not the configurations themselves, which may differ in non-semantic fields alone.
+        # Not the configurations themselves, which may differ only in non-semantic fields.
         is_semantic = not field.metadata.get(_NON_SEMANTIC)
         if is_semantic and value != fingerprint_fields(default_of(field)):
             plain[field.name] = value

@@ -22,18 +22,18 @@ ENTRY_POINTS = "crisalad_jax.plugins"
 """Group of entry points under which an installed package names its modules of parts."""
 _PACKAGE = __name__.partition(".")[0]
 _FROM_FILE = "crisalad_plugin_"
-"""Beginning of the names of modules that are loaded from plug-in files."""
+"""Prefix of the names of modules that are loaded from plug-in files."""
 _LARGEST = 2**24
-"""Most bytes of a plug-in's file: Python reads and copies it whole."""
+"""Most bytes of a plug-in file: Python reads and copies all of it."""
 _LOADED: dict[str, str] = {}
-"""What `load_plugin` loaded, in that order, of a file its whole path; and its module's name."""
+"""What `load_plugin` loaded, in order (for a file, its absolute path), and the module's name."""
 
 
 @takes(plugin=str)
 def load_plugin(plugin: str) -> None:
     r"""Import a plug-in, once, so that its parts are registered.
 
-    Its code runs: load what you trust.
+    Its code is run: load only what you trust.
 
     Args:
         plugin: a file FILE.py, or the name of a module that can be imported.
@@ -76,19 +76,19 @@ def load_plugin(plugin: str) -> None:
 
 
 def loaded_plugins() -> list[str]:
-    """Return what `load_plugins` takes to load the same in another process."""
+    """Return what `load_plugins` takes to load the same plug-ins in another process."""
     return list(_LOADED)
 
 
 def load_plugins(plugins: Iterable[str]) -> None:
-    """Load these plug-ins, and those of installed packages; raises as `load_plugin`."""
+    """Load these plug-ins, and those of installed packages; raise what `load_plugin` raises."""
     load_entry_points()
     for plugin in plugins:
         load_plugin(plugin)
 
 
 def _spec_of(plugin: str) -> ModuleSpec | None:
-    """Find the code of a plug-in; None where there is none."""
+    """Find the code of a plug-in; None if there is none."""
     if not plugin.endswith(".py"):
         try:
             return importlib.util.find_spec(plugin)
@@ -123,8 +123,8 @@ def _import(spec: ModuleSpec) -> None:
 def plugin_failure(error: BaseException) -> str | None:
     """Describe in one line an exception that plug-ins may have caused; None without plug-ins.
 
-    If it came from a plug-in's code, the line says where. Else a plug-in may have returned what
-    nothing here can work with, so the line names all plug-ins. `SystemExit` must be a plug-in's.
+    If it came from a plug-in's code, the line says where. Otherwise a plug-in may have returned
+    something unusable, so the line names all plug-ins. `SystemExit` must come from a plug-in.
     """
     files = {str(sys.modules[name].__file__) for name in _LOADED.values()}
     places = [p for p in traceback.extract_tb(error.__traceback__) if p.filename in files]
@@ -139,8 +139,8 @@ def plugin_failure(error: BaseException) -> str | None:
 def home_of(module: str | None) -> str | None:
     """Return what `--plugin` takes to load a part's module: a file's name, or the module.
 
-    Files record it: no folder, so that a copy on another machine is the same. None for modules of
-    this package, and where there is no file or no module, as in a notebook or in `exec`.
+    Files record it, without a folder, so that a copy on another machine is the same. None for
+    modules of this package, and if there is no file or no module, as in a notebook or in `exec`.
     """
     if module is None or module.partition(".")[0] == _PACKAGE:
         return None
@@ -166,7 +166,7 @@ def load_entry_points() -> None:
 def source_digest(part: type[Part]) -> str | None:
     """Compute the digest of the file that defines a plug-in's part.
 
-    None where there is no file, and for a part of this package, whose version says what it is.
+    None if there is no file, and for a part of this package, which the version identifies.
     """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
     if part.__module__.partition(".")[0] == _PACKAGE or file is None:
@@ -175,7 +175,7 @@ def source_digest(part: type[Part]) -> str | None:
 
 
 def sources_of(config: Any) -> dict[str, tuple[str, str | None]]:
-    """Return the name and the source's digest of every part in a configuration."""
+    """Return the name and the source digest of every part in a configuration."""
     return {
         field: (part.part_name, source_digest(type(part)))
         for field, part in parts_of(config).items()

@@ -1,4 +1,4 @@
-"""How a photograph becomes a network's input: its size, the filter, and what pixels are less."""
+"""How a photograph becomes a network's input: its size, filter and normalisation."""
 
 import dataclasses
 import math
@@ -12,11 +12,11 @@ from crisalad_jax.config.short_repr import short_repr
 Size = tuple[int, int]
 """Height and width in pixels."""
 BitDepth = Literal["high-byte", "contrast-stretch"]
-"""How more than 8 bits a colour become 8."""
+"""How colours of more than 8 bits become 8-bit ones."""
 LocalFeatures = Literal["sift", "orb"]
-"""What photographs may become in place of pixels."""
+"""Local features that can replace the pixels of photographs."""
 FEATURE_BYTES: Mapping[str, int] = {"sift": 129, "orb": 33}
-"""Bytes of a local feature: its descriptor's, and a last one that is 0 where there is none."""
+"""Bytes of a local feature: its descriptor's, and a last one that is 0 if there is no feature."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
@@ -29,7 +29,7 @@ WORDS: Mapping[str, Mapping[str, Any]] = {
     "round": {"round_to_patch": True},
     **{name: {"bit_depth": name} for name in ("high-byte", "contrast-stretch")},
 }
-"""Words of the flag --resize, and the fields that they set."""
+"""Values of the flag --resize, and the fields that they set."""
 
 
 @short_repr(switch=("normalisation", "local-contrast", "mean", "deviation"))
@@ -37,11 +37,11 @@ WORDS: Mapping[str, Mapping[str, Any]] = {
 class PreprocessingConfig:
     """How a photograph becomes a network's input.
 
-    Published models differ in it, and a descriptor moves by 1e-3 to 6e-2 with another filter. The
-    defaults are the chain of torchvision on Pillow's images: `Resize`, `ToTensor`, `Normalize`.
+    Published models differ in it, and another filter changes a descriptor by 1e-3 to 6e-2. The
+    defaults are torchvision's chain on Pillow images: `Resize`, `ToTensor`, `Normalize`.
 
-    A tensor is resized before it is normalised by some authors, and after it by others. Both give
-    the same numbers, because resizing is linear and its weights sum to 1: there is no field for it.
+    Some authors resize a tensor before they normalise it, others after. The result is the same,
+    because resizing is linear and its weights sum to 1, so there is no field for it.
 
     Example:
         >>> chain = PreprocessingConfig(filter="bicubic", pixels="floats")
@@ -52,33 +52,33 @@ class PreprocessingConfig:
     size_rule: Literal["fixed", "shorter-side", "longer-side", "native"] = non_semantic_field(
         "fixed"
     )
-    """What size an image gets. "fixed" is `ModelConfig.image_size`, whatever the aspect ratio. The
-    others keep the aspect ratio: "shorter-side" gives the shorter side the length of that of
-    `image_size`, "longer-side" shrinks images until the longer side is at most that of
-    `image_size` and never enlarges, and "native" leaves images as they are. Their sides are then
-    rounded to the nearest multiples of the patch size, where the backbone takes no others."""
+    """Target size of an image. "fixed" is `ModelConfig.image_size`, whatever the aspect ratio. The
+    others keep the aspect ratio: "shorter-side" resizes the shorter side to that of `image_size`,
+    "longer-side" shrinks images until the longer side is at most that of `image_size` and never
+    enlarges, and "native" leaves images as they are. Their sides are then rounded to the nearest
+    multiples of the patch size, if the backbone takes no others."""
     filter: Literal["bilinear", "bicubic", "area"] = non_semantic_field("bilinear")
-    """Filter of the resize; "area" is OpenCV's INTER_AREA, which hloc takes."""
+    """Filter of the resize; "area" is OpenCV's INTER_AREA, which hloc uses."""
     antialias: bool = non_semantic_field(True)
-    """Whether the filter widens where an image shrinks, as Pillow's always does."""
+    """Whether the filter widens when an image shrinks, as Pillow's always does."""
     pixels: Literal["bytes", "floats"] = non_semantic_field("bytes")
     """What is resized: "bytes" are rounded after each pass, as Pillow does; "floats" are neither
     rounded nor clamped, as torch does."""
     round_to_patch: bool = non_semantic_field(False)
-    """Whether images of a fixed size that is no multiple of the patch size are resized once more,
-    to the nearest one (halves to the even number), bilinear and antialiased. MegaLoc does so."""
+    """Whether images of a fixed size that is not a multiple of the patch size are resized again,
+    to the nearest one (halves to even), bilinear and antialiased. MegaLoc does so."""
     bit_depth: BitDepth = non_semantic_field("high-byte")
-    """How more than 8 bits a colour become 8, before the resize. "high-byte" drops the low byte of
+    """How colours of over 8 bits become 8-bit, before the resize. "high-byte" drops the low byte of
     16. "contrast-stretch" spreads each image's own values, from the 1st to the 99th percentile,
     over 0 to 255: for thermal images, whose values fill a small part of 16 bits, and for floats.
     8-bit images stay as they are."""
     normalisation: Literal["mean-deviation", "local-contrast"] = "mean-deviation"
     """How pixels are normalised: by `mean` and `deviation`, or by those of each neighbourhood."""
     mean: tuple[float, float, float] = IMAGENET_MEAN
-    """Mean of red, green and blue, of pixels from 0 to 1; by default ImageNet's."""
+    """Mean of red, green and blue, for pixels from 0 to 1; by default ImageNet's."""
     deviation: tuple[float, float, float] = IMAGENET_DEVIATION
-    """What pixels from 0 to 1, less the mean, are divided by; by default ImageNet's. A network
-    that takes pixels from 0 to 255 less a mean, as hloc's NetVLAD, has a deviation of 1/255."""
+    """Divisor of pixels from 0 to 1 minus the mean; by default ImageNet's. A network that takes
+    pixels from 0 to 255 minus a mean, such as hloc's NetVLAD, has a deviation of 1/255."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -102,15 +102,15 @@ class PreprocessingConfig:
         return self.round_to_patch or self.size_rule != "fixed"
 
     def target_size(self, size: Size, image_size: Size) -> Size:
-        """Return the size that an image gets by `size_rule`, before sides are rounded.
+        """Return the target size of an image under `size_rule`, before sides are rounded.
 
         Args:
             size: height and width of the image.
             image_size: height and width of the model, `ModelConfig.image_size`.
 
         Returns:
-            Height and width in pixels. torchvision cuts the fraction off the other side, and hloc
-            rounds it; so do the rules that are theirs.
+            Height and width in pixels. "shorter-side" truncates the other side, as torchvision
+            does; "longer-side" rounds it, as hloc does.
 
         Example:
             >>> rule = PreprocessingConfig(size_rule="shorter-side")
@@ -132,7 +132,7 @@ class PreprocessingConfig:
         return height, width
 
     def rounded_size(self, size: Size, side_multiple: int) -> Size:
-        """Round sides to the nearest multiples, where they are to be rounded.
+        """Round sides to the nearest multiples, if sides are to be rounded.
 
         Args:
             size: height and width of `target_size`.
@@ -151,17 +151,17 @@ class PreprocessingConfig:
         return height, width
 
     def for_training(self) -> "PreprocessingConfig":
-        """Return the chain of training: the same filter by Pillow's rules, at a fixed size.
+        """Return the chain for training: the same filter by Pillow's rules, at a fixed size.
 
-        All published training loaders resize Pillow's images: bytes, antialiased.
+        All published training loaders resize Pillow images: bytes, antialiased.
         """
         return dataclasses.replace(self, size_rule="fixed", pixels="bytes", antialias=True)
 
     def changed_by(self, words: Sequence[str]) -> "PreprocessingConfig":
-        """Return this chain with the fields that some of `WORDS` set.
+        """Return this chain with the fields set by values of --resize (see `WORDS`).
 
         Raises:
-            InputError: an unknown word, two for one field, or one without effect.
+            InputError: an unknown value, two for one field, or one without effect.
 
         Example:
             >>> PreprocessingConfig().changed_by(["native", "bicubic"]).filter

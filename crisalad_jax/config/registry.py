@@ -60,7 +60,7 @@ class Registry(Generic[P]):
                 part's defaults.
 
         Raises:
-            InputError: when it decorates: the name is taken, or the part is not of this kind.
+            InputError: when decorating: the name is taken, or the part is not of this kind.
         """
         where = f"register_{self.kind}"
         require(
@@ -76,7 +76,7 @@ class Registry(Generic[P]):
         return decorate
 
     def _class_of(self, part: Callable[..., Any]) -> type[P]:
-        """Return a part's class, that of a plain function included."""
+        """Return the class of a part, and make one for a plain function."""
         if self._of_function is not None and callable(part) and not inspect.isclass(part):
             members = {
                 "__doc__": part.__doc__ or f"The {self.kind} {part.__name__}.",
@@ -93,7 +93,7 @@ class Registry(Generic[P]):
             part = dataclasses.dataclass(frozen=True)(cast(Any, part))
         methods = {each for each in dir(self.base) if callable(getattr(self.base, each))}
         for field in dataclasses.fields(cast(Any, part)):
-            # Files have a part's own name and plug-in among its fields.
+            # Files store a part's own name and plug-in among its fields.
             is_free = field.name not in {NAME, PLUGIN, *methods}
             require(is_free, f"found a field {field.name!r}, which has another meaning here")
         return cast(type[P], part)
@@ -140,8 +140,8 @@ class Registry(Generic[P]):
         """Return the class of the part with this name; if needed, load installed plug-ins first.
 
         Args:
-            name: of the part.
-            plugin: the plug-in that registered it, where that is known.
+            name: the part's name.
+            plugin: the plug-in that registered it, if known.
             where: what messages call the name; None is the kind.
 
         Raises:
@@ -171,14 +171,14 @@ class Registry(Generic[P]):
         return part(**{**self._presets.get(name, {}).get(preset or "", {}), **fields})
 
     def resolve(self, value: Any, where: str) -> P:
-        """Return a part as it is, and make one that is given by its name.
+        """Return a part as it is, or make the one with the given name.
 
         Args:
             value: a part or its name.
             where: what messages call the value.
 
         Raises:
-            InputError: a name that is not registered, or a value that is no part of this kind.
+            InputError: a name that is not registered, or a value that is not a part of this kind.
         """
         if isinstance(value, str):
             return self.find(value, where=where)()
@@ -250,7 +250,7 @@ def resolve_names(config: Any) -> None:
     """Check a new configuration's types, and replace names by parts.
 
     Raises:
-        InputError: a name that is not registered, a value that is no part of the kind, or what
+        InputError: a name that is not registered, a value that is not a part of the kind, or what
             `check_types` raises.
     """
     check_types(config)
@@ -275,8 +275,8 @@ def with_arguments(*offered: str) -> Callable[[Callable[..., Any]], Mapping[str,
 def count_arguments(function: Callable[..., Any], *offered: str) -> int:
     """Return how many of the offered arguments, in their order, a plain function takes.
 
-    It takes those that it requires, and those that have the name of the one that is offered. A
-    setting with a default, such as `temperature=0.1`, keeps it.
+    It takes those that it requires, and those whose names match the offered ones. A setting with a
+    default, such as `temperature=0.1`, keeps its default.
 
     Raises:
         InputError: it requires more arguments.

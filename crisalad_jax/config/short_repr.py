@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, SupportsIndex, TypeVar
 
 _T = TypeVar("_T")
 _WIDTH = 88
-"""Characters of a line, at most: as a notebook shows without a scroll bar."""
+"""Most characters in a line: what a notebook shows without a scroll bar."""
 _FEW = 4
-"""Number of items in a collection that is shown whole; of a larger one the first is shown."""
+"""Most items of a collection that is shown in full; of a larger one only the first is shown."""
 
 
 class _Style(NamedTuple):
@@ -35,15 +35,15 @@ def short_repr(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]
     Its `help` shows the texts below its fields.
 
     Args:
-        *always: fields that are printed at their defaults too.
-        switch: a field, its value with which others are not in use, and the names of these; by
-            default of all others. They are left out, and not compared (`config.io.differences`).
+        *always: fields that are printed even at their defaults.
+        switch: a field, the value at which other fields are unused, and their names; without names,
+            all others. They are left out, and not compared (`config.io.differences`).
     """
     return lambda cls: _print_in(_Style(always, switch), cls)
 
 
 def brief(cls: type[_T]) -> type[_T]:
-    """Give a class of results a `repr` of a line for each field, whatever its size.
+    """Give a result class a `repr` with one line for each field, whatever its size.
 
     Arrays print as type and shape, parameters as their number, collections as their first items.
     `help` shows the texts below the fields.
@@ -77,14 +77,14 @@ def _style_of(value: Any) -> _Style:
 def concise_repr(value: Any) -> str:
     """Write a value as the call that makes it, without fields that change nothing.
 
-    Those are fields at their defaults, and fields that are not in use. A part at its defaults is
-    its name. Long calls take a line for each field.
+    Those are fields at their defaults, and unused fields. A part at its defaults prints as its
+    name. Long calls take a line for each field.
 
     Args:
         value: a dataclass, or a NamedTuple that is `brief`.
 
     Returns:
-        For a configuration Python, where the classes that it names are imported.
+        For a configuration, valid Python once the classes that it names are imported.
 
     Example:
         >>> from crisalad_jax import CrossImageConfig, ModelConfig
@@ -95,13 +95,13 @@ def concise_repr(value: Any) -> str:
 
 
 def in_one_line(value: Any) -> str:
-    """Write any value for a message: a configuration in one line, of other values the first."""
+    """Write any value for a message: a configuration in one line, others by their first line."""
     first, *more = _write(value, math.inf).splitlines() or [""]
     return f"{first} ..." if more else first
 
 
 def _write(value: Any, width: float) -> str:
-    """Write a value in a line of this width, or else in one for each field, or item of a tuple."""
+    """Write a value in a line of this width, or else with a line for each field or tuple item."""
     name, parts = type(value).__qualname__, _fields
     if isinstance(value, tuple) and type(value).__repr__ is tuple.__repr__:
         name, parts = "", lambda values, each: (_write(item, each) for item in values)
@@ -137,7 +137,7 @@ def _short(value: Any) -> str:
         return _write(value, math.inf)
     if isinstance(value, pathlib.PurePath):
         return repr(str(value))
-    if isinstance(value, float):  # a fraction has four digits, and metres all of theirs
+    if isinstance(value, float):  # four digits of a fraction, and all digits of metres
         return f"{value:.4g}" if abs(value) < 1000 else repr(value)
     if isinstance(value, Mapping):
         return _few("{}", len(value), (f"{k!r}: {_short(v)}" for k, v in value.items()))
@@ -179,7 +179,7 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
-    """List a configuration's fields without those that its switch puts out of use.
+    """List a configuration's fields, without those that its switch makes unused.
 
     Example:
         >>> from crisalad_jax import ProjectionConfig
@@ -202,7 +202,7 @@ def with_field_docs(cls: type[_T]) -> type[_T]:
 
 
 class _Doc(str):
-    """A docstring that is completed when it is shown: to read sources would slow an import.
+    """A docstring that is completed when it is shown: reading sources would slow down imports.
 
     `help`, and `?` in a notebook, begin with `expandtabs`.
     """

@@ -1,7 +1,7 @@
-"""Make the groups of classes that train a descriptor by classification (CosPlace, EigenPlaces).
+"""Group the classes that train a descriptor by classification (CosPlace, EigenPlaces).
 
-Two classes of one group are never neighbours, so images of one spot are never of two of its
-classes. A group is a training set of its own (`Places`) whose places are the classes.
+Two classes of one group are never neighbours, so images of one spot never belong to two of its
+classes. Each group is a separate training set (`Places`) whose places are the classes.
 """
 
 import collections
@@ -19,14 +19,14 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Bool, Float64, Int32, Int64
 
 _WIDEST = 60.0
-"""Degrees of longitude of a city's images; a plane of more stretches distances by over 15 %."""
+"""Widest city in degrees of longitude; a wider plane stretches distances by over 15 %."""
 _ADVICE = "; --loss.kind.classes.kind places takes its places for classes"
 _ONE_SPOT = 1e-3
-"""Spread in metres of a cell's images below which they do not show the direction of a street."""
+"""Smallest spread in metres of a cell's images that shows the direction of a street."""
 
 
 class Views(NamedTuple):
-    """City, position and heading of every image; metres are of one UTM zone for each city."""
+    """City, position and heading of every image, in metres of one UTM zone per city."""
 
     city: Int32[np.ndarray, " images"]
     east: Float64[np.ndarray, " images"]
@@ -35,14 +35,14 @@ class Views(NamedTuple):
     heading: Float64[np.ndarray, " images"]
     """Heading in degrees clockwise from north, 0 to 360; NaN where unknown."""
     known: Bool[np.ndarray, " cities"]
-    """Whether a city's positions are real; False where all its images have the same one."""
+    """Whether a city's positions are real; False if all its images have the same one."""
 
 
 def views_of(places: Places) -> Views:
     """Project positions to UTM; a city's zone is that of its median longitude.
 
     Raises:
-        InputError: a city is wider than a plane can be.
+        InputError: a city is too wide for one plane.
     """
     count = len(places.files)
     latitude, longitude, heading = (
@@ -66,10 +66,10 @@ def views_of(places: Places) -> Views:
 
 
 def known_views(places: Places, what: str, *, headings: bool) -> Views:
-    """Return the views of images that all have a position, and with `headings` a heading too.
+    """Return the views if all images have a position and, with `headings`, a heading too.
 
     Raises:
-        InputError: some have none, and `what` needs them; or what `views_of` raises.
+        InputError: some have none, although `what` needs them; or what `views_of` raises.
     """
     views = views_of(places)
     needed, column = ("headings, or no positions", ",heading") if headings else ("positions", "")
@@ -82,20 +82,20 @@ def known_views(places: Places, what: str, *, headings: bool) -> Views:
 
 
 class Class(NamedTuple):
-    """The images of one class; an image may be of no class."""
+    """The images of one class; an image may belong to no class."""
 
     images: Int64[np.ndarray, " images"]
     group: int
-    """Classes of one group are no neighbours."""
+    """Classes of a group are not neighbours."""
 
 
 def class_groups(
     places: Places, config: ClassesConfig, *, min_images: int, places_per_batch: int
 ) -> tuple[Places, ...]:
-    """Make the groups that epochs train in turn, as sets whose places are classes.
+    """Make the groups that successive epochs train on, as sets whose places are classes.
 
-    At most `config.groups` groups are taken: those with the most classes. Viewpoints make twice as
-    many, of which lateral and frontal groups alternate.
+    At most `config.groups` groups are used: those with the most classes. Viewpoints make twice as
+    many: lateral and frontal groups alternate.
 
     Args:
         places: all images, read with `min_images=1` for classes other than places.
@@ -104,8 +104,8 @@ def class_groups(
         places_per_batch: smallest number of classes in a group.
 
     Raises:
-        InputError: positions are asked for and missing, no class has enough images, or a group has
-            fewer classes than a batch asks for.
+        InputError: required positions are missing, no class has enough images, or a group has fewer
+            classes than a batch needs.
     """
     chosen: list[list[list[Class]]] = []
     for classes in find_classes(places, config, min_images):
@@ -126,7 +126,7 @@ def class_groups(
 
 
 def find_classes(places: Places, config: ClassesConfig, min_images: int) -> list[list[Class]]:
-    """Make the sets of classes: one, or the lateral and the frontal one."""
+    """Make the sets of classes: a single one, or a lateral and a frontal one."""
     if config.kind == "places":
         return [_place_classes(places, views_of(places), config, min_images)]
     what = f"loss.kind.classes.kind {config.kind!r}{_ADVICE}"
@@ -153,8 +153,8 @@ def focal_classes(views: Views, config: ClassesConfig, min_images: int) -> list[
     The first principal direction of a cell's positions is the direction of its street. A class
     looks at one focal point, `focal_distance` from the cell's mean: across the street, or along it.
     The paper crops images from panoramas. Here an image belongs to the class if its heading is
-    within `view_angle` of the direction from its position to the focal point. Each line has two
-    focal points, of which the one that more images look at is taken.
+    within `view_angle` of the direction from its position to the focal point. Of the two focal
+    points on each line, the one that more images look at is used.
     """
     group, keys = _cells(views, config)
     sides: list[list[Class]] = [[], []]
@@ -192,11 +192,11 @@ def focal_points(
 def _place_classes(
     places: Places, views: Views, config: ClassesConfig, min_images: int
 ) -> list[Class]:
-    """Deal the set's places to groups; where positions are known, no group has two neighbours.
+    """Assign the set's places to groups; if positions are known, no group has two neighbours.
 
-    A place that is a neighbour in every group is of no class.
+    A place that has a neighbour in every group gets no class.
     """
-    from scipy.spatial import KDTree  # takes a fifth of a second
+    from scipy.spatial import KDTree  # the import takes a fifth of a second
 
     group = np.full(len(places.names), -1)
     is_large = places.image_counts >= min_images
@@ -236,7 +236,7 @@ def _cells(
 def _by_key(
     keys: Int64[np.ndarray, "images key"], group: Int64[np.ndarray, " images"], min_images: int
 ) -> list[Class]:
-    """Make a class of the images of each key, in the order of keys."""
+    """Make one class from the images of each key, ordered by key."""
     _, number, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     order = np.argsort(number.reshape(-1), kind="stable")
     members = np.split(order, np.cumsum(counts)[:-1])

@@ -1,8 +1,8 @@
-"""A cache on disk of files at addresses, of bounded size, which several processes may share.
+"""A cache of remote files on disk, of bounded size, which several processes may share.
 
-fsspec's own caches of whole files have no bound. Here each of 256 folders has an equal share of the
-room and drops its least recently used files alone, so that no process waits for another, and a
-kill at any moment leaves nothing but whole files, and temporary ones that age like the others.
+fsspec's own caches of whole files have no size limit. Here each of 256 folders has an equal share
+of the space and evicts only its own least recently used files, so that no process waits for
+another. A kill at any moment leaves only complete files, and temporary ones that age like them.
 """
 
 import contextlib
@@ -17,41 +17,41 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_folder
 
 CACHE_GB = 32.0
-"""Gigabytes that are cached unless a user says otherwise: GSV-Cities has 24."""
+"""Default size of the cache in gigabytes: GSV-Cities has 24."""
 _FOLDERS = 256
 _SCANS = 32
-"""A folder is scanned once for every so many parts of its share that are written, on average: its
-files are too many to be counted for each. It then drops four such parts more than it has to."""
+"""Parts of a folder's share. A folder is scanned, on average, once per part that is written, as it
+has too many files to count at every write. It then evicts four parts more than needed."""
 _DIGEST = 16
 
 
 class FileCache:
-    """A cache of files at addresses; threads and processes may share its folder.
+    """A cache of remote files; threads and processes may share its folder.
 
-    A file is compared with that at the address (size and ETag, or what the store has) when a run
-    reads it for the first time, and is not asked for again in that run.
+    When a run first reads a file, it is compared with the remote one (size and ETag, or what the
+    store has); it is not checked again in that run.
     """
 
     def __init__(self, folder: pathlib.Path, limit: float) -> None:
-        """Take the folder, and the most bytes of its files.
+        """Set the folder, and the largest total size of its files in bytes.
 
         Raises:
-            InputError: files cannot be made there.
+            InputError: files cannot be created there.
         """
         check_folder(folder)
         self._folder, self._share, self._began = folder, limit / _FOLDERS, time.time()
 
     def read(self, path: str | os.PathLike[str]) -> bytes:
-        """Read the file at an address, or the same file in the cache.
+        """Read a remote file, from the cache if it has the same file.
 
         Raises:
-            InputError: it is in neither, or the address cannot be asked.
+            InputError: it is in neither place, or the address cannot be accessed.
         """
         name = _digest(address_of(path).encode()).hex()
         file = self._folder / str(int(name, 16) % _FOLDERS) / name
         state = data = b""
         used = 0.0
-        # Another process may remove the file at any moment; what is open stays readable.
+        # Another process may remove the file at any moment; an open file stays readable.
         with contextlib.suppress(OSError):
             used = file.stat().st_mtime
             with file.open("rb") as opened:
@@ -77,7 +77,7 @@ class FileCache:
                     temporary.write_bytes(whole)
 
     def _make_room(self, folder: pathlib.Path, size: int) -> None:
-        """Remove the files of a folder that were not used for longest."""
+        """Remove the least recently used files of a folder."""
         folder.mkdir(parents=True, exist_ok=True)
         with os.scandir(folder) as entries:
             files = [(each.path, each.stat()) for each in entries]

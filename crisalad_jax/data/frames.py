@@ -1,8 +1,8 @@
-"""Names of frames of videos and robot logs, which say when they were taken.
+"""Names of frames of videos and robot logs, which include the time.
 
-A frame of a video is `walk.mp4#t=12.500`, in seconds of the file. One of a log (a ROS bag) is
-`walk.mcap#/camera/image_raw#t=1700000000.123456789`, with its topic and its stamp. Such a name is
-taken wherever the path of an image is.
+A frame of a video is `walk.mp4#t=12.500`, in seconds of the file. A frame of a log (a ROS bag) is
+`walk.mcap#/camera/image_raw#t=1700000000.123456789`, with its topic and its stamp. Such names are
+accepted wherever the path of an image is.
 """
 
 import collections
@@ -19,20 +19,20 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 LOG_SUFFIXES = (".mcap", ".bag", ".db3")
 """Suffixes of robot logs, in lower case."""
 FASTEST = 1000.0
-"""Most frames a second: names of videos have milliseconds."""
+"""Most frames per second: names of video frames have milliseconds."""
 _TIME = re.compile(r"(.+)#t=(\d+)(?:\.(\d+))?", re.S)
 _TOPIC = re.compile(r"(.+)#([^#\s]+)", re.S)
 _OF_BAGS = b"rosbag2_bagfile_information"
-"""What `metadata.yaml` of a bag that is a folder begins with."""
+"""Beginning of the `metadata.yaml` of a bag that is a folder."""
 _SINCE_1970 = re.compile(r"(?<![\d.])(1\d{9})(?:\.(\d+)|(\d{3}|\d{6}|[_-]?\d{9}))?(?![\d])")
 """Seconds from 2001 to 2033, then decimals, or the digits of milli-, micro- or nanoseconds.
-ROS writes seconds and nanoseconds apart."""
+ROS writes seconds and nanoseconds separately."""
 _UNIX = 1_000_000_000
-"""Seconds since 1970 from which stamps are of that clock, in 2001; a simulation starts at 0."""
+"""Stamps from this one on (in 2001) are seconds since 1970; those of a simulation start at 0."""
 
 
 class FrameName(NamedTuple):
-    """A frame's name in parts."""
+    """The parts of a frame's name."""
 
     file: str
     """The video or log."""
@@ -42,11 +42,11 @@ class FrameName(NamedTuple):
 
     @property
     def milliseconds(self) -> int:
-        """The time as videos have it."""
+        """The time in milliseconds, as in videos."""
         return round(self.nanoseconds / 1_000_000)
 
     def __str__(self) -> str:
-        """Return the name as every verb writes it."""
+        """Return the name in its standard spelling."""
         if self.topic is None:
             return f"{self.file}#t={self.milliseconds / 1000:.3f}"
         seconds, rest = divmod(self.nanoseconds, 10**9)
@@ -54,12 +54,12 @@ class FrameName(NamedTuple):
 
 
 def is_video(path: str | os.PathLike[str]) -> bool:
-    """Return whether a name ends as a video's does."""
+    """Return whether a name has the suffix of a video."""
     return os.fspath(path).lower().endswith(VIDEO_SUFFIXES)
 
 
 def is_log(path: str | os.PathLike[str]) -> bool:
-    """Return whether a name ends as a robot log's does, or is that of a ROS 2 bag's folder."""
+    """Return whether a path has the suffix of a robot log, or is the folder of a ROS 2 bag."""
     about = pathlib.Path(path, "metadata.yaml")
     if not about.is_file():
         return os.fspath(path).lower().endswith(LOG_SUFFIXES) and not os.path.isdir(path)
@@ -68,12 +68,12 @@ def is_log(path: str | os.PathLike[str]) -> bool:
 
 
 def has_frames(path: str | os.PathLike[str]) -> bool:
-    """Return whether a name is that of a video or a robot log."""
+    """Return whether a path is a video or a robot log."""
     return is_video(path) or is_log(path)
 
 
 def parse_frame(path: str | os.PathLike[str]) -> FrameName | None:
-    """Read the name of a frame, with any number of decimals; None for other names.
+    """Parse the name of a frame, with any number of decimals; None for other names.
 
     Example:
         >>> parse_frame("walk.bag#/camera#t=1700000000.5")
@@ -101,7 +101,7 @@ def frame_name(video: str | os.PathLike[str], milliseconds: int) -> str:
 
 
 def spelled(name: str) -> str:
-    """Return a frame's name as every verb writes it; other names as they are.
+    """Return a frame's name in its standard spelling; other names unchanged.
 
     Example:
         >>> spelled("walk.mp4#t=12.5"), spelled("a.jpg")
@@ -123,13 +123,13 @@ def frame_time(path: str | os.PathLike[str]) -> float | None:
 
 
 def file_of(path: str | os.PathLike[str]) -> pathlib.Path:
-    """Return the file that holds an image: of a frame, its video or log, which may be a folder."""
+    """Return the file that holds an image; for a frame its video or log, which may be a folder."""
     frame = parse_frame(path)
     return pathlib.Path(path if frame is None else frame.file)
 
 
 def stored_bytes(path: str | os.PathLike[str]) -> int | None:
-    """Return the bytes of the file that holds an image, as `file_of`; None where there is none."""
+    """Return the size in bytes of the file that holds an image (`file_of`); None if missing."""
     file = file_of(path)
     files = file.iterdir() if file.is_dir() and is_log(file) else [file]
     sizes = [each.stat().st_size for each in files if each.is_file()]
@@ -137,7 +137,7 @@ def stored_bytes(path: str | os.PathLike[str]) -> int | None:
 
 
 def sequence_of(path: pathlib.PurePath) -> str:
-    """Return what an image is one of: of a frame, its video, or its log and topic; else its folder.
+    """Return the sequence of an image: of a frame, its video, or log and topic; else its folder.
 
     Example:
         >>> sequence_of(pathlib.PurePosixPath("a/walk.bag#/camera#t=1700000000.5"))
@@ -148,7 +148,7 @@ def sequence_of(path: pathlib.PurePath) -> str:
 
 
 def by_sequence(paths: Sequence[pathlib.PurePath]) -> list[list[int]]:
-    """Return the numbers of the images of each folder, video or topic, in order; see `sequence_of`.
+    """Return the indices of the images of each folder, video or topic, in order (`sequence_of`).
 
     Example:
         >>> by_sequence([pathlib.PurePosixPath(name) for name in ("a/1.jpg", "b/1.jpg", "a/2.jpg")])
@@ -161,17 +161,17 @@ def by_sequence(paths: Sequence[pathlib.PurePath]) -> list[list[int]]:
 
 
 def check_rate(fps: float) -> None:
-    """Raise InputError for a number of frames a second that no video is sampled at."""
+    """Raise InputError if a number of frames per second is out of range."""
     if not 0 < fps <= FASTEST:
         raise InputError(f"fps: found {fps:g}, expected more than 0, and at most {FASTEST:g}")
 
 
 def sampled(milliseconds: Sequence[int], fps: float) -> list[int]:
-    """Choose the frames that are nearest after each 1 / fps seconds.
+    """Choose the first frame at or after each multiple of 1 / fps seconds.
 
     Args:
         milliseconds: times of all frames, in order.
-        fps: as `check_rate` takes it; more than there are chooses all.
+        fps: frames per second (see `check_rate`); a rate above the video's chooses all.
 
     Returns:
         Their indices.
@@ -190,15 +190,15 @@ def sampled(milliseconds: Sequence[int], fps: float) -> list[int]:
 
 
 class Moment(NamedTuple):
-    """A time on some clock: moments of two clocks say nothing of each other."""
+    """A time on some clock; times on different clocks cannot be compared."""
 
     clock: str
-    """The video, camera or simulation that the time is of; "" is seconds since 1970."""
+    """The video, camera or simulation whose clock it is; "" is seconds since 1970."""
     seconds: float
 
 
 def moment_of(name: str | os.PathLike[str]) -> Moment | None:
-    """Read the moment in an image's name; None where it has none, or several.
+    """Read the time in an image's name; None if it has none, or several.
 
     Example:
         >>> moment_of("walk.mp4#t=12.500")

@@ -28,28 +28,28 @@ from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.shapes import UInt8
 
 MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
-"""Environment variable of the largest image in pixels, which OpenCV reads as it is imported and
-checks before it decodes. A small file can claim an image that fills the memory: this package sets
-2**28, which takes 0.8 GB, where the variable is not set."""
+"""Environment variable for the largest image in pixels, which OpenCV reads when it is imported and
+checks before decoding. A small file can claim an image that fills the memory: if the variable is
+not set, this package sets 2**28, which takes 0.8 GB."""
 OnBadImage = Literal["skip", "stop"]
-"""What an image that is missing or cannot be read does: it is left out, or ends the work."""
+"""What to do about an image that is missing or cannot be read: leave it out, or stop."""
 _OF_JPEG = (".jpg", ".jpeg", ".jpe", ".jfif")
 _SUFFIXES = (
     *_OF_JPEG,
     *(".png", ".webp", ".bmp", ".tif", ".tiff", ".gif", ".avif", ".jp2"),
     *(".ppm", ".pgm", ".pbm", ".pnm"),
 )
-# OpenCV has no list of what it decodes. It decodes what it encodes, and builds differ in that.
+# OpenCV does not list what it decodes. It decodes what it encodes, and builds differ in that.
 IMAGE_SUFFIXES = tuple(
     suffix for suffix in _SUFFIXES if suffix in _OF_JPEG or cv2.haveImageWriter(suffix)
 )
-"""Suffixes of images, in lower case, wherever files are looked for by name. Decoding goes by
+"""Suffixes of images, in lower case, used to find files by name. Decoding depends only on their
 content."""
 SELF_CHECKED = (*_OF_JPEG, ".png")
-"""Suffixes of images that `decode_image` finds cut short by their own marks."""
+"""Suffixes of the formats in which `decode_image` can detect that a file is cut short."""
 _FORMATS = f"an image ({' '.join(IMAGE_SUFFIXES)})"
 _PNG_SIDE = 1_000_000
-"""Largest side that libpng decodes; of a larger one it writes lines to stderr."""
+"""Largest side that libpng decodes; for larger ones it prints to stderr."""
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _AVIF = (b"ftypavif", b"ftypavis")
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -79,24 +79,24 @@ def read_image(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image file as 8-bit RGB, upright.
 
-    With `enough`, a JPEG is decoded at a half, a quarter or an eighth of its size, as long as that
-    is at least twice `enough`. Decoding is faster. After resizing, the image differs by one or two
-    levels of 256 (root mean square) from one decoded at full size.
+    With `enough`, a JPEG is decoded at half, a quarter or an eighth of its size, as long as that is
+    at least twice `enough`. This is faster. After resizing, the image differs by one or two levels
+    of 256 (root mean square) from one decoded at full size.
 
     - JPEG, PNG, WebP, BMP, TIFF, GIF, AVIF, JPEG 2000 and PPM, PGM, PBM are read.
     - The EXIF orientation is applied, and an AVIF's rotation.
     - 16 bits become 8 by dropping the low byte (v >> 8), unless `bit_depth` says otherwise.
     - Grey is repeated over the channels, a palette is looked up, CMYK is converted (for JPEG in
-      Adobe's inverted convention, as Pillow has it).
+      Adobe's inverted convention, as in Pillow).
     - Alpha is dropped, as by Pillow's convert("RGB"): the hidden colours show. TIFF and GIF are the
-      exceptions: transparency shows black (libtiff composites), or the GIF's background.
-    - The first page or frame of several is taken.
+      exceptions: transparency shows as black (libtiff composites), or as the GIF's background.
+    - Of several pages or frames, the first is read.
 
     Args:
         path: the image file, or a frame of a video, as in `walk.mp4#t=12.500` (seconds), or of a
             robot log (see docs/how-to/image-sources.md).
-        size: height and width in pixels to resize to, by the default of `resize_image`; None keeps
-            the file's. Where a model has another way, `prepare_image` follows it.
+        size: height and width in pixels to resize to, with the defaults of `resize_image`; None
+            keeps the file's size. `prepare_image` resizes as a model's configuration says.
         enough: height and width in pixels that the image will be resized to; None for full size.
         bit_depth: how more than 8 bits become 8; see `PreprocessingConfig`.
 
@@ -104,9 +104,9 @@ def read_image(
         The image, in red, green and blue.
 
     Raises:
-        InputError: the file is missing, a folder, empty, cut short, larger than 2**28 pixels
-            (OPENCV_IO_MAX_IMAGE_PIXELS), or no image of the formats above; never half a picture. Or
-            floats or signed integers without "contrast-stretch", or a `size` without a pixel.
+        InputError: the file is missing, a folder, empty, cut short (part of an image is never
+            returned), larger than 2**28 pixels (OPENCV_IO_MAX_IMAGE_PIXELS) or in another format;
+            floats or signed integers without "contrast-stretch"; or a `size` without pixels.
 
     Example:
         >>> read_image(pictures / "0.png").shape
@@ -126,7 +126,7 @@ def read_pixels(
 ) -> np.ndarray:
     """Read an image file as `read_image` does, in the file's own depth; see `decode_image`.
 
-    `read_far` reads the bytes at an address.
+    `read_far` reads the bytes of a remote file.
     """
     frame = parse_frame(path)
     if frame is None and is_remote(path):
@@ -135,7 +135,7 @@ def read_pixels(
         return decode_image(read_bytes(path, "an image file"), path, enough=enough)
     if frame.topic is None:
         return read_frame(frame)
-    from crisalad_jax.data.logs import open_log  # which decodes by this module
+    from crisalad_jax.data.logs import open_log  # here, because it imports this module
 
     return open_log(frame.file).read(frame.topic, frame.nanoseconds, enough=enough)
 
@@ -148,14 +148,14 @@ def decode_image(
     Args:
         data: all bytes of the file.
         path: the file's name, for messages.
-        enough: as of `read_image`.
+        enough: see `read_image`.
 
     Returns:
-        The image, upright: red, green and blue, or grey (height, width). PNG, TIFF and PNM of more
-        than 8 bits keep them; `prepare_image` makes 8 of them, as the model's configuration says.
+        The image, upright: RGB, or grey (height, width). PNG, TIFF and PNM of more than 8 bits
+        keep them; `prepare_image` reduces them to 8 as the model's configuration says.
 
     Raises:
-        InputError: as `read_image`.
+        InputError: see `read_image`.
     """
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
     # libjpeg write warnings to stderr that OpenCV's log level does not silence.
@@ -179,16 +179,16 @@ def decode_image(
 
 
 def _decoded(data: np.ndarray, start: bytes, reduction: int) -> np.ndarray | None:
-    """Decode with the flags under which OpenCV reads a format right; None where it cannot."""
+    """Decode with the flags with which OpenCV reads a format correctly; None if it cannot."""
     is_tiff, is_avif = start[:4] in _TIFF_SIGNATURES, start[4:] in _AVIF
-    # Asked for RGB, OpenCV 5.0 confuses red and blue in a TIFF of 16 bits and an AVIF with alpha.
+    # With its RGB flag, OpenCV 5.0 mixes up red and blue in 16-bit TIFF and in AVIF with alpha.
     is_bgr = is_tiff or is_avif
     flags = (cv2.IMREAD_COLOR if is_bgr else cv2.IMREAD_COLOR_RGB) | reduction
-    # Of AVIF and JPEG 2000 OpenCV makes 8 bits itself, because theirs may be 10 or 12.
+    # AVIF and JPEG 2000 may have 10 or 12 bits, which OpenCV itself converts to 8.
     if is_tiff or start.startswith((_PNG_SIGNATURE, b"P")):
         flags |= cv2.IMREAD_ANYDEPTH
     image = cv2.imdecode(data, flags)
-    if image is None and is_tiff:  # floats, and integers of 32 bits
+    if image is None and is_tiff:  # floats and 32-bit integers
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim == 2 or not is_bgr:
         return image
@@ -196,12 +196,12 @@ def _decoded(data: np.ndarray, start: bytes, reduction: int) -> np.ndarray | Non
 
 
 def _full_range(image: np.ndarray | None, data: bytes) -> np.ndarray | None:
-    """Spread a PNM's values over its 8 or 16 bits: its header says what white is (Netpbm)."""
+    """Scale a PNM's values to its full 8 or 16 bits: its header has the value of white (Netpbm)."""
     header = _PNM_HEADER.match(data)
     if image is None or header is None:
         return image
     white, most = int(header[1]), np.iinfo(image.dtype).max
-    is_text = data[1] in b"23"  # of which OpenCV spreads 8 bits itself
+    is_text = data[1] in b"23"  # OpenCV itself scales these in 8 bits
     if not 0 < white < most or (is_text and most == 255):
         return image
     return np.rint(np.minimum(image, white) / white * most).astype(image.dtype)  # as Pillow
@@ -212,7 +212,7 @@ def _jpeg_is_whole(data: bytes) -> bool:
 
     Segments are skipped by their length, so the end of a thumbnail inside EXIF does not count.
     """
-    # A file cut off behind its thumbnail passes too, but has no pixels to decode.
+    # A file cut off after its thumbnail passes too, but has no pixels to decode.
     return data.endswith(b"\xff\xd9") or any(code == 0xD9 for code, _ in _jpeg_segments(data))
 
 
@@ -245,9 +245,9 @@ def _reduction(data: bytes, enough: tuple[int, int] | None) -> int:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Return whether a PNG has a size that decodes, and chunks up to IEND with right checksums.
+    """Return whether a PNG has a decodable size, and chunks up to IEND with correct checksums.
 
-    Chunks whose name begins with a small letter are not needed for the pixels.
+    Chunks whose name begins with a lower-case letter are not needed for the pixels.
     """
     position = len(_PNG_SIGNATURE)
     while position + 12 <= len(data):
@@ -276,24 +276,24 @@ def _turned(image: np.ndarray, data: bytes) -> np.ndarray:
 
 
 def _boxes(data: bytes, holder: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the type and the content of the boxes in the first box of the type `holder`."""
+    """Yield the type and content of each box in the first box of type `holder`."""
     place = data.find(holder)
     end = place - 4 + int.from_bytes(data[place - 4 : place], "big")
     at = place + 4
     while place > 0 and at + 8 < end:
         size = int.from_bytes(data[at : at + 4], "big")
-        if size < 8:  # to the end of the file, or of 64 bits: no property is
+        if size < 8:  # up to the end of the file, or a 64-bit size: not a property
             return
         yield data[at + 4 : at + 8], data[at + 8 : at + size]
         at += size
 
 
 def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
-    """Find the images under `folder`, in the order of their posix paths relative to it.
+    """Find the images under `folder`, sorted by their posix paths relative to it.
 
-    The search is recursive and follows links to folders. Files are taken by `IMAGE_SUFFIXES`, in
-    any case. Hidden files and folders (a name that starts with a dot) are left out; a note counts
-    the other files.
+    The search is recursive and follows links to folders. Files are matched by `IMAGE_SUFFIXES`, in
+    upper or lower case. Hidden files and folders (a name that starts with a dot) are left out; a
+    note counts the other files.
 
     Raises:
         InputError: the folder is missing, is a file, or holds no image.
@@ -322,15 +322,15 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
 def images_below(
     folder: pathlib.Path, files: Iterable[pathlib.Path], source: pathlib.Path
 ) -> list[pathlib.Path]:
-    """Return the images among files below a folder, without hidden ones, in the order of paths.
+    """Return the images among the files below a folder, without hidden ones, sorted by path.
 
     Args:
-        folder: the folder, here or at an address.
-        files: what was found there.
-        source: what the message begins with.
+        folder: the folder, local or remote.
+        files: the files in it.
+        source: prefix of the message.
 
     Raises:
-        InputError: no image is among them.
+        InputError: none of them is an image.
     """
     named = {each.relative_to(folder).as_posix(): each for each in files}
     shown = [named[name] for name in sorted(named) if "/." not in f"/{name}"]
@@ -338,14 +338,14 @@ def images_below(
 
 
 def check_folder(folder: pathlib.Path, expected: str) -> None:
-    """Raise InputError unless there is such a folder; `expected` is what the message calls it."""
+    """Raise InputError unless the folder exists; `expected` is what the message calls it."""
     if not folder.is_dir():
         kind = "a file" if folder.exists() else "nothing"
         raise InputError(f"{folder}: found {kind}, expected {expected}")
 
 
 def is_image(path: str | os.PathLike[str]) -> bool:
-    """Return whether a name ends as that of an image that is read."""
+    """Return whether a name has the suffix of a readable image format."""
     return os.fspath(path).lower().endswith(IMAGE_SUFFIXES)
 
 
@@ -355,12 +355,12 @@ def only_images(
     """Return the images among files, and count the others by suffix in a note.
 
     Args:
-        files: what was found.
-        source: what the message begins with, such as their folder.
-        frames: whether videos and robot logs, which have frames, are wanted too.
+        files: the files.
+        source: prefix of messages, such as their folder.
+        frames: whether to return videos and robot logs, which have frames, too.
 
     Raises:
-        InputError: no image is among them.
+        InputError: none of them is an image.
     """
     images, others = [], []
     for file in files:
@@ -386,10 +386,10 @@ def only_images(
 
 
 def names_in(folder: pathlib.PurePath, images: Sequence[pathlib.PurePath]) -> list[str]:
-    """Return the images' posix paths relative to their folder, each checked to fit a line of text.
+    """Return the images' posix paths relative to their folder, if each fits in one line of text.
 
     Raises:
-        InputError: a name has a line break in it, or bytes that are no UTF-8.
+        InputError: a name contains a line break, or bytes that are not UTF-8.
     """
     names = [image.relative_to(folder).as_posix() for image in images]
     check_lines(names, folder)
@@ -401,10 +401,10 @@ def check_lines(names: Sequence[str], source: object) -> None:
 
     Args:
         names: the names of images.
-        source: what the message begins with, such as their folder.
+        source: prefix of the message, such as their folder.
 
     Raises:
-        InputError: a name has a line break in it, or bytes that are no UTF-8.
+        InputError: a name contains a line break, or bytes that are not UTF-8.
 
     Example:
         >>> check_lines(["street/a.jpg"], "images")

@@ -1,4 +1,4 @@
-"""Images as they come: files that appear in a folder, and the newest frame of a camera."""
+"""Live images: files that appear in a folder, and the newest frame of a camera."""
 
 import contextlib
 import math
@@ -24,38 +24,37 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
 _POLL = 0.05
-"""Seconds between two looks into a folder, and four times what a look takes if that is longer."""
+"""Seconds between two scans of a folder, or four times a scan's duration if that is longer."""
 _SETTLED = 1.0
-"""Seconds for which a file of another format stays as it is before it counts as whole."""
+"""Seconds for which a file of another format must stay unchanged to count as complete."""
 _PATIENCE = 5.0
-"""Seconds for which an unreadable file stays as it is before it is given up."""
+"""Seconds for which an unreadable file must stay unchanged to be given up."""
 _TURN = 0.1
-"""Longest seconds between two calls of `check`."""
+"""Longest time in seconds between two calls of `check`."""
 
 
 @brief
 class Frame(NamedTuple):
-    """A picture with its moment."""
+    """An image and its time."""
 
     name: str
-    """The file's path in its folder, or the camera, or a video's name, and the time."""
+    """The file's path in its folder, or the camera's or video's name and the time."""
     time: float
-    """Seconds: into a video; else since 1970, of the file's last change or the camera's frame."""
+    """Seconds into a video; else since 1970, of the file's last change or the camera's frame."""
     image: np.ndarray
-    """RGB or grey, upright, in the depth of the file; a camera's of 8 bits."""
+    """RGB or grey, upright, in the depth of the file; 8 bits from a camera."""
     taken: float
-    """`time.perf_counter()` when it was in hand: a whole file, or a frame from the camera."""
+    """`time.perf_counter()` when it was available: a complete file, or a camera's frame."""
     dropped: int = 0
-    """Number of frames that were passed over between the frame taken before and this one."""
+    """Number of frames dropped between the previously taken frame and this one."""
 
 
 class FolderWatch:
-    """The images that appear in a folder and its subfolders, each once, when it is whole.
+    """The images that appear in a folder and its subfolders, each once, when it is complete.
 
-    Those that are there before are left out. The folder is looked at 20 times a second, which
-    works on any file system. A JPEG or PNG is whole when it decodes; files of other formats when
-    they have not changed for a second. A file that stays unreadable for five is left out, with a
-    note.
+    Existing images are left out. The folder is scanned 20 times a second, which works on any file
+    system. A JPEG or PNG is complete when it decodes; a file of another format when it has not
+    changed for a second. A file that stays unreadable for five seconds is left out, with a note.
 
     Example:
         >>> import shutil
@@ -67,13 +66,13 @@ class FolderWatch:
     """
 
     size: Size | None = None
-    """Height and width of all frames; None where that is unknown."""
+    """Height and width of all frames; None if unknown."""
     dropped = 0
-    """Number of frames passed over for newer ones: none."""
+    """Number of frames dropped for newer ones: none."""
 
     @takes(folder=PATH)
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        """Note what is there.
+        """List the existing images.
 
         Args:
             folder: the folder.
@@ -85,7 +84,7 @@ class FolderWatch:
         check_folder(self._folder, "a folder to watch")
         self._done = set(self._scan())
         self.there = len(self._done)
-        """Number of images that were there before."""
+        """Number of images that existed before."""
 
     def _scan(self) -> Iterator[pathlib.Path]:
         for parent, folders, files in os.walk(self._folder):
@@ -95,20 +94,20 @@ class FolderWatch:
                     yield pathlib.Path(parent, name)
 
     def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
-        """Yield images as they appear, without end; the oldest first where there are several.
+        """Yield images as they appear, without end; of several, the oldest first.
 
         Args:
-            check: called several times a second; it may raise, to end this.
+            check: called several times a second; it may raise to end the loop.
         """
         waiting: dict[pathlib.Path, tuple[tuple[int, int], float]] = {}
-        """Size and time of change of a file, and since when it has these."""
+        """A file's size and time of change, and since when it has these."""
         while True:
             check()
             begun = time.monotonic()
             found: list[tuple[float, pathlib.Path]] = []
             for path in self._scan():
                 if path not in self._done:
-                    with contextlib.suppress(OSError):  # gone again
+                    with contextlib.suppress(OSError):  # deleted meanwhile
                         there = path.stat()
                         state = (there.st_size, there.st_mtime_ns)
                         if path not in waiting or waiting[path][0] != state:
@@ -139,13 +138,13 @@ class FolderWatch:
 
 
 _Played = Generator[tuple[float, tuple[np.ndarray, float, str]]]
-"""Seconds from the beginning when a frame is due; its image, time and name."""
+"""When a frame is due, in seconds from the beginning; its image, time and name."""
 
 
 class LatestFrame:
-    """A queue of one frame: a source that is given frames from outside, such as by a ROS callback.
+    """A queue of one frame: a source that is filled from outside, for example by a ROS callback.
 
-    A frame that nobody took before the next one came is passed over, and counted. Any thread may
+    A frame that is not taken before the next one arrives is dropped, and counted. Any thread may
     `put` frames while another one takes them.
 
     Example:
@@ -160,22 +159,22 @@ class LatestFrame:
     """
 
     size: Size | None = None
-    """Height and width of all frames; None where that is unknown."""
+    """Height and width of all frames; None if unknown."""
 
     def __init__(self, *, fps: float | None = None) -> None:
-        """Begin without a frame.
+        """Create an empty queue.
 
         Args:
-            fps: most frames a second that `frames` yields; None is as many as are asked for.
+            fps: most frames per second that `frames` yields; None yields as many as requested.
 
         Raises:
-            InputError: a rate out of range.
+            InputError: the rate is out of range.
         """
         if fps is not None:
             check_rate(fps)
         self._fps = fps
         self.dropped = 0
-        """Number of frames passed over for newer ones."""
+        """Number of frames dropped for newer ones."""
         self._changed = threading.Condition()
         self._newest: Frame | None = None
         self._ended = False
@@ -189,13 +188,13 @@ class LatestFrame:
         self.close()
 
     def put(self, image: np.ndarray, stamp: float, name: str | None = None) -> None:
-        """Give the newest frame, in place of one that waits.
+        """Add the newest frame, replacing one that waits.
 
         Args:
-            image: 8-bit RGB (height, width, 3), or what else `prepare_image` takes. It must not
-                change afterwards.
-            stamp: its moment in seconds, such as since 1970.
-            name: what its answer calls it; None is the camera and the time.
+            image: 8-bit RGB (height, width, 3), or anything else that `prepare_image` takes. It
+                must not change afterwards.
+            stamp: its time in seconds, for example since 1970.
+            name: its name in the answer; None takes the camera and the time.
         """
         taken = time.perf_counter()
         name = frame_name("camera", round(1000 * stamp)) if name is None else name
@@ -206,10 +205,10 @@ class LatestFrame:
             self._changed.notify()
 
     def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
-        """Yield the newest frame, time and again, until the source is closed or ends.
+        """Yield the newest frame, repeatedly, until the source is closed or ends.
 
         Args:
-            check: called several times a second; it may raise, to end this.
+            check: called several times a second; it may raise to end the loop.
         """
         due = 0.0
         while True:
@@ -229,17 +228,17 @@ class LatestFrame:
                 return
 
     def close(self) -> None:
-        """End `frames`, after the frame that waits."""
+        """End `frames` after the waiting frame."""
         with self._changed:
             self._ended = True
             self._changed.notify()
 
 
 class Camera(LatestFrame):
-    """The newest frame of a camera, whenever one is asked for; older ones are passed over.
+    """The newest frame of a camera, whenever one is requested; older ones are dropped.
 
-    A thread takes all frames from the camera, so that none waits in the camera's own queue. A
-    video file or a robot log plays at its own pace, as if it were a camera.
+    A thread reads all frames from the camera, so that none waits in the camera's own queue. A video
+    file or a robot log plays at its own speed, like a camera.
 
     Example:
         >>> import cv2, numpy as np
@@ -265,14 +264,14 @@ class Camera(LatestFrame):
         """Open the camera.
 
         Args:
-            camera: its number, from 0, or a URL, or a video file, or a robot log (a ROS bag).
-            fps: most frames a second that `frames` yields; None is as many as are asked for.
-            rate: how many times as fast as its own pace a file plays.
-            topic: of a robot log, the topic of the images; None is the only one that has any.
+            camera: its number from 0, a URL, a video file, or a robot log (a ROS bag).
+            fps: most frames per second that `frames` yields; None yields as many as requested.
+            rate: speed at which a file plays, as a multiple of its own.
+            topic: topic of the images in a robot log; None takes the only one that has any.
 
         Raises:
-            InputError: it cannot be opened, or gives no frame; a rate out of range; or a topic that
-                the log does not have.
+            InputError: it cannot be opened, or gives no frame; the rate is out of range; or the log
+                does not have the topic.
         """
         super().__init__(fps=fps)
         require(0 < rate < math.inf, f"rate: found {rate:g}, expected more than 0")
@@ -285,10 +284,10 @@ class Camera(LatestFrame):
         self._is_file = from_log or pathlib.Path(given).is_file()
         self._rate = rate
         self.name = _name(given)
-        """What messages call it: no user or password of a URL."""
+        """Its name in messages: no user or password of a URL."""
         self._begins = pathlib.Path(given).name if self._is_file else self.name
         self.size: Size | None
-        """Height and width of the frames; None where the camera does not tell."""
+        """Height and width of the frames; None if the camera does not report it."""
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None
@@ -318,13 +317,13 @@ class Camera(LatestFrame):
         self._played = self._captured(capture)
 
     def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
-        """Yield the newest frame, time and again, until the camera or the video ends.
+        """Yield the newest frame, repeatedly, until the camera or the video ends.
 
         Args:
-            check: called several times a second; it may raise, to end this.
+            check: called several times a second; it may raise to end the loop.
 
         Raises:
-            InputError: a camera, which is no video file, gives no more frames.
+            InputError: a camera that is not a file gives no more frames.
         """
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
@@ -335,7 +334,7 @@ class Camera(LatestFrame):
             raise InputError(f"camera: found no more frames from {self.name}, expected it to go on")
 
     def _play(self) -> None:
-        """Put frames until there are no more; a file's at their times."""
+        """Put frames until there are no more; those of a file at their times."""
         begun = time.monotonic()
         try:
             with contextlib.closing(self._played) as frames:
@@ -344,15 +343,15 @@ class Camera(LatestFrame):
                     if self._closing.is_set():
                         break
                     self.put(*frame)
-        except Exception as error:  # for `frames` to raise, in the thread that asks
+        except Exception as error:  # `frames` raises it in the caller's thread
             self._failure = error
         finally:
             super().close()
 
     def _captured(self, capture: cv2.VideoCapture) -> _Played:
-        """Yield when a camera's or a video's frames are due, and what `put` takes.
+        """Yield when each frame of a camera or video is due, and the arguments of `put`.
 
-        The first is grabbed already.
+        The first frame has already been grabbed.
         """
         try:
             grabbed = True
@@ -369,7 +368,7 @@ class Camera(LatestFrame):
             capture.release()
 
     def _logged(self, log: Log, topic: str) -> _Played:
-        """Yield when a log's frames are due, and what `put` takes."""
+        """Yield when each frame of a log is due, and the arguments of `put`."""
         begun = None
         for stamp, image in log.images(topic):
             begun = stamp if begun is None else begun
@@ -377,17 +376,17 @@ class Camera(LatestFrame):
             yield (stamp - begun) / 10**9, (image, stamp / 10**9, name)
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
         self._closing.set()
         if self._thread is None:
             if self._capture is not None:
                 self._capture.release()
         else:
-            self._thread.join(timeout=1)  # a camera that hangs is left to the end of the process
+            self._thread.join(timeout=1)  # a hanging camera is released when the process ends
 
 
 def _name(camera: str) -> str:
-    """Return a camera's name without what may be a secret in a URL."""
+    """Return a camera's name without the parts of a URL that may be secret."""
     if camera.isdecimal():
         return f"camera-{camera}"
     if "://" not in camera:

@@ -25,7 +25,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
 
-if TYPE_CHECKING:  # who only reads images starts sooner without them
+if TYPE_CHECKING:  # lazy, because reading images needs none of them
     from crisalad_jax.data.augmentations.base import Augmentation
     from crisalad_jax.data.query_set import QuerySet
     from crisalad_jax.data.samplers.base import Describe, Sampler
@@ -34,11 +34,11 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 BATCHES_AHEAD = 2
 THREADS = usable_cores()
-"""OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
+"""OpenCV releases the GIL while decoding: two cores decode about 500 photographs a second."""
 
 
 _SMALL = 16
-"""Largest number of images that is padded to a power of two, so that few sizes are compiled."""
+"""Up to this many images are padded to a power of two, so that few sizes are compiled."""
 
 
 @brief
@@ -48,15 +48,15 @@ class ImageBatch(NamedTuple):
     images: UInt8[np.ndarray, "batch h w 3"] | Float32[np.ndarray, "batch h w 3"]
     """8-bit pixels, or normalised floats; zeros where not valid."""
     labels: Int32[np.ndarray, " batch"]
-    """Place index, or tuple and role (`losses.pairs`); position in the list of paths where there
-    are no groups; -1 for padding."""
+    """Place index, or tuple and role (`losses.pairs`); without groups, position in the list of
+    paths; -1 for padding."""
     valid: Bool[np.ndarray, " batch"]
     indices: Int64[np.ndarray, " batch"]
-    """Image index, also of an unreadable image; -1 for padding."""
+    """Image index, also for unreadable images; -1 for padding."""
 
 
 class _OneThread:
-    """A context without OpenCV's own threads, in which any number of threads may be."""
+    """A context that turns off OpenCV's own threads; any number of threads may enter it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -77,7 +77,7 @@ class _OneThread:
 
 
 _ONE_THREAD = _OneThread()
-"""For images that are already decoded on all cores."""
+"""Used where images are already decoded on all cores."""
 
 
 class ImageCache:
@@ -92,7 +92,7 @@ class ImageCache:
         budget_bytes: int = 2**30,
         read_far: Callable[[str | os.PathLike[str]], bytes] = read_remote,
     ) -> None:
-        """Start empty, with room for `budget_bytes` of pixels; `read_far` reads at addresses."""
+        """Create an empty cache for `budget_bytes` of pixels; `read_far` reads remote files."""
         self._room, self._read_far = budget_bytes, read_far
         self._images: dict[tuple[str, Preparation, bool], Pixels] = {}
         self._lock = threading.Lock()
@@ -100,7 +100,7 @@ class ImageCache:
     def read(
         self, path: str | os.PathLike[str], how: Preparation, *, quickly: bool = False
     ) -> Pixels:
-        """Read and prepare an image, from memory if it is there; the array is read-only.
+        """Read and prepare an image, from memory if it is cached; the array is read-only.
 
         With `quickly` a JPEG may be decoded at a smaller size; see `read_image`.
 
@@ -121,7 +121,7 @@ class ImageCache:
         return image
 
     def fill(self, paths: Iterable[str | os.PathLike[str]], how: Preparation) -> None:
-        """Read images in this order, as far as there is room; `read` tells of unreadable ones."""
+        """Cache images in this order until the budget is spent; `read` reports unreadable ones."""
         for path in paths if self._room else ():
             with contextlib.suppress(InputError):
                 if self.read(path, how, quickly=True).nbytes > self._room:
@@ -131,7 +131,7 @@ class ImageCache:
 @with_field_docs
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How images are read: how many at a time, and what one that cannot be read does.
+    """Options for reading images: batch size, threads and what to do about unreadable images.
 
     Example:
         >>> Reading(batch_size=32, on_bad_image="skip").batch_size
@@ -155,7 +155,7 @@ class Reading:
         check_count("batch size", self.batch_size)
 
     def fitted(self, images: int) -> Self:
-        """Return a smaller batch size where the batches of so few images would be mostly padding.
+        """Reduce the batch size if there are so few images that a batch would be mostly padding.
 
         Example:
             >>> [Reading(batch_size=32).fitted(count).batch_size for count in (1, 3, 12, 20, 50)]
@@ -169,16 +169,16 @@ class Reading:
     ) -> Iterator[ImageBatch]:
         """Yield batches of image files, in order; the last one is padded.
 
-        Where a rule gives images sizes of their own, consecutive images of one size make a batch,
-        and every change of size ends and pads one: then a `batch_size` of 1 saves work. Under
-        "skip" an image that cannot be read is not valid but keeps its index.
+        If the size rule gives images different sizes, a batch holds consecutive images of one size,
+        and every change of size ends and pads a batch: then a `batch_size` of 1 saves work. Under
+        "skip" an unreadable image is not valid but keeps its index.
 
         Args:
             paths: the files.
             preparation: how the model's images are prepared.
 
         Raises:
-            InputError: while iterating under "stop" for an image that cannot be read.
+            InputError: while iterating, for an unreadable image under "stop".
         """
         cache = self.cache or ImageCache(0)
         slots = np.arange(len(paths))
@@ -202,9 +202,9 @@ class Reading:
     ) -> Iterator[ImageBatch]:
         """Yield batches of what `load` returns for each of `slots`, with its index and label.
 
-        A batch holds the next `batch_size` of them, or fewer where the size changes. Of images with
-        frames of videos one thread at most reads: more would read a video each, from its beginning.
-        Of images at addresses, `far` away, most threads wait, so that there are more.
+        A batch holds the next `batch_size` images, or fewer where the size changes. At most one
+        thread reads video frames, because each thread would read the video from its beginning.
+        Remote images (`far`) get more threads, because most of these wait.
         """
         least = AT_ONCE if far and self.threads else 0
         threads = min(self.threads, 1) if has_frames else max(self.threads, least)
@@ -253,38 +253,38 @@ def training_batches(
     cache: ImageCache | None = None,
     describe: "Describe | None" = None,
 ) -> Iterator[ImageBatch]:
-    """Yield the batches of one epoch, place after place.
+    """Yield the batches of one epoch, place by place.
 
-    The same (seed, epoch, step) gives the same bits, whatever `threads`, `start_step`
-    and `part`. Images are resized to `image_size` (height, width), large ones from a
-    JPEG's smaller scale (see `read_image`), then augmented. An image that cannot be read stops the
-    epoch or, under "skip", leaves a slot that is not valid.
+    The same (seed, epoch, step) gives bit-identical batches for any `threads`, `start_step` and
+    `part`. Images are resized to `image_size` (height, width), then augmented; large JPEGs are
+    decoded at a smaller scale first (see `read_image`). An unreadable image stops the epoch or,
+    under "skip", leaves a slot that is not valid.
 
     Args:
-        places: what to draw from.
+        places: the places to draw from.
         image_size: height and width in pixels that images are resized to.
-        places_per_batch: number of places of a batch.
-        images_per_place: number of images of each.
+        places_per_batch: number of places in a batch.
+        images_per_place: number of images of each place.
         sampler: draws the batches; a registered sampler, or its name.
         augmentation: changes each image; a registered augmentation, or its name.
-        seed: draws everything, together with the epoch and the step.
-        epoch: from 0.
-        preprocessing: whose filter resizes bytes. Every image gets the same size, whatever its
-            rule.
+        seed: seeds all random draws, together with the epoch and the step.
+        epoch: number of the epoch, from 0.
+        preprocessing: sets the filter that resizes bytes. Every image gets the same size, whatever
+            its size rule.
         steps: number of batches; None takes what the sampler draws, which is every place once.
-        start_step: the first batch to give, to go on with an epoch that was interrupted.
-        part: (i, n) gives the i-th of n equal parts of every batch, for the i-th of n processes.
+        start_step: the first batch to yield, to resume an interrupted epoch.
+        part: (i, n) yields the i-th of n equal parts of every batch, for the i-th of n processes.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
-        threads: how many decode ahead; 0 decodes in the caller's thread.
-        cache: holds decoded images from epoch to epoch.
-        describe: takes image files and returns their descriptors, for samplers that draw by them.
+        threads: number of threads that decode ahead; 0 decodes in the caller's thread.
+        cache: stores decoded images between epochs.
+        describe: takes image files and returns their descriptors, for samplers that use them.
 
     Yields:
         The batches: pixels, labels, and which images are valid.
 
     Raises:
-        InputError: at once for arguments out of range, or a sampler that finds no batch; while
-            iterating under "stop" for an image that cannot be read.
+        InputError: at once, for arguments out of range or a sampler that finds no batch; while
+            iterating, for an unreadable image under "stop".
 
     Example:
         >>> from crisalad_jax import read_places
@@ -329,21 +329,21 @@ def batches_of_groups(
     threads: int = THREADS,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
-    """Yield batches of chosen images, which are groups of images of a place, or mined tuples.
+    """Yield batches of chosen images: groups of images of a place, or mined tuples.
 
     Args:
         files: the images.
-        chosen: the images of every batch.
+        chosen: indices of the images of every batch.
         labels: their labels.
-        image_size: see `training_batches`, as for all that follow.
-        augmentation: changes each image; what it draws for a place is the same in a group.
-        seed: numbers that draw the changes, together with the step.
-        preprocessing: whose filter resizes bytes.
-        start_step: the first batch to give.
-        part: (i, n) gives the i-th of n equal parts of every batch.
+        image_size: see `training_batches`, also for the arguments below.
+        augmentation: changes each image; a group shares what is drawn for its place.
+        seed: numbers that seed the augmentation, together with the step.
+        preprocessing: sets the filter that resizes bytes.
+        start_step: the first batch to yield.
+        part: (i, n) yields the i-th of n equal parts of every batch.
         on_bad_image: "stop" or "skip".
-        threads: how many decode ahead.
-        cache: holds decoded images.
+        threads: number of threads that decode ahead.
+        cache: stores decoded images.
 
     Yields:
         The batches.
@@ -366,7 +366,7 @@ def batches_of_groups(
     how = Preparation(image_size, preprocessing.for_training())
     cache = cache or ImageCache(0)
     if has_frames := _has_frames(files.files):
-        # In order: the frames of a batch are far from each other, with all others in between.
+        # Read in order, because the frames of a batch are far apart in the video.
         cache.fill(map(files.path, np.unique(chosen)), how)
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
@@ -374,7 +374,7 @@ def batches_of_groups(
     def load(number: int) -> Pixels:
         image = cache.read(files.path(indices[number]), how, quickly=True)
         step, slot = divmod(number, batch_size)
-        # The spawn key makes this stream, one for each place, independent of each image's.
+        # The spawn key makes each place's stream independent of the streams of the images.
         place = (*seed, step, slot // images_per_group)
         of_place = np.random.default_rng(np.random.SeedSequence(place, spawn_key=(1,)))
         generator = np.random.default_rng((*seed, step, slot))
@@ -397,13 +397,13 @@ def read_ahead(
 ) -> Generator[_Result, None, None]:
     """Yield the result of `work` for each item, in the order of the items.
 
-    Closing the generator cancels the work that has not begun.
+    Closing the generator cancels work that has not started.
 
     Args:
         work: the function.
-        items: what to work on.
-        ahead: number of items that are worked on before they are asked for.
-        threads: number of threads; 0 works in the caller's.
+        items: its arguments.
+        ahead: number of items to work on before they are requested.
+        threads: number of threads; 0 works in the caller's thread.
     """
     if not threads:
         yield from map(work, items)
@@ -422,10 +422,10 @@ def read_ahead(
 
 
 def one_ahead(stream: Generator[_Item, None, None]) -> Generator[_Item, None, None]:
-    """Yield a stream's items, each computed in a thread while the item before it is in use.
+    """Yield a stream's items, computing each in a thread while the previous one is in use.
 
-    The first two are not: where there is one, as in a search of a small map, a thread would take
-    longer to start than the search.
+    The first two are computed directly: for a single item, as in a search of a small map, starting
+    a thread would take longer than the search.
     """
     with contextlib.closing(stream):
         yield from itertools.islice(stream, 1)
@@ -442,7 +442,7 @@ def one_ahead(stream: Generator[_Item, None, None]) -> Generator[_Item, None, No
 def _same_size_runs(
     images: Iterable[Pixels | None], batch_size: int
 ) -> Iterator[list[Pixels | None]]:
-    """Yield runs of at most `batch_size` consecutive images of one size; None is of any size."""
+    """Yield runs of at most `batch_size` consecutive images of one size; None fits any size."""
     run: list[Pixels | None] = []
     for image in images:
         if len({each.shape for each in (*run, image) if each is not None}) > 1:
@@ -457,7 +457,7 @@ def _same_size_runs(
 
 
 def _padded_batch(run: Sequence[Pixels | None], batch_size: int, how: Preparation) -> ImageBatch:
-    """Make a batch of images; where none of them can be read, they have the model's size."""
+    """Pad images to a batch; if none of them can be read, they get the model's image size."""
     sizes = (image.shape[:2] for image in run if image is not None)
     batch = ImageBatch(
         images=np.zeros((batch_size, *next(sizes, how.size_of(how.image_size)), 3), how.dtype),

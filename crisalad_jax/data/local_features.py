@@ -1,4 +1,4 @@
-"""Hand-made local features of a photograph by OpenCV, as rows of bytes that travel like pixels."""
+"""Hand-crafted local features of a photograph by OpenCV, as rows of bytes in an image's shape."""
 
 import cv2
 import numpy as np
@@ -10,11 +10,11 @@ from crisalad_jax.utils.shapes import UInt8
 def encode_local_features(
     image: UInt8[np.ndarray, "h w 3"], kind: LocalFeatures, count: int
 ) -> UInt8[np.ndarray, "count third 3"]:
-    """Find the strongest local features of a photograph, by OpenCV's defaults.
+    """Find the strongest local features of a photograph, with OpenCV's defaults.
 
     Args:
         image: RGB.
-        kind: "sift" (Lowe, IJCV 2004), of 128 numbers of 0 to 255; or "orb" (Rublee et al., ICCV
+        kind: "sift" (Lowe, IJCV 2004), of 128 values from 0 to 255; or "orb" (Rublee et al., ICCV
             2011), of 256 bits.
         count: number of rows; those without a feature are 0.
 
@@ -26,7 +26,7 @@ def encode_local_features(
     points, found = detector.detectAndCompute(grey, None)  # pyright: ignore
     rows = np.zeros((count, FEATURE_BYTES[kind]), np.uint8)
     if found is not None:
-        # OpenCV keeps all that are as strong as the last one.
+        # OpenCV returns all features that are as strong as the last one.
         strongest = np.argsort([-point.response for point in points], kind="stable")[:count]
         rows[: len(strongest), :-1] = found[strongest]
         rows[: len(strongest), -1] = 1

@@ -1,7 +1,7 @@
 """Images and positions of robot logs: ROS 1 bags (.bag), ROS 2 bags (.mcap, .db3, or a folder).
 
-The fields of messages are those of ROS's common_interfaces, the encodings of images those of its
-`sensor_msgs/image_encodings.hpp` and of cv_bridge.
+The fields of messages are those of ROS's common_interfaces; the encodings of images are those of
+its `sensor_msgs/image_encodings.hpp` and of cv_bridge.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ _NO_FIX = -1
 _OPEN = 2
 """Number of logs that stay open between frames."""
 _FAR = 30 * 10**9
-"""Nanoseconds ahead from which opening a log there beats reading all that is between."""
+"""Nanoseconds ahead from which opening a log there is faster than reading all in between."""
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "rgb8": ("u1", 3, None),
     "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
@@ -57,7 +57,7 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), ("u1", 2, cv2.COLOR_YUV2RGB_YUY2)),
     "32FC1": ("f4", 1, None),
 }
-"""Type of a value, values of a pixel, and OpenCV's conversion to RGB."""
+"""Type of a value, values per pixel, and OpenCV's conversion to RGB."""
 
 
 class Topic(NamedTuple):
@@ -80,7 +80,7 @@ class _Frames(NamedTuple):
     stamps: Int64[np.ndarray, " n"]
     """In order, each once."""
     numbers: Int64[np.ndarray, " n"]
-    """Of each, the number of its message in the log's order."""
+    """Number of each image's message, in the log's order."""
     logged: Int64[np.ndarray, " m"]
     """When each message was logged, in the log's order."""
 
@@ -88,8 +88,8 @@ class _Frames(NamedTuple):
 class Log:
     """A robot log: its topics, the images of one, and the positions of another.
 
-    Stamps are nanoseconds since 1970: of the message's header or, where that has none, of when it
-    was logged. Nothing but headers stays in memory, and threads may share it.
+    Stamps are nanoseconds since 1970: from the message's header or, if that has none, when it was
+    logged. Only headers stay in memory, and threads may share a log.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -115,7 +115,7 @@ class Log:
         """Return the name of the topic that images are taken from.
 
         Args:
-            name: the topic's; None is the only one that has images.
+            name: the topic's name; None takes the only one that has images.
 
         Raises:
             InputError: no such topic, one without images, or several and no name.
@@ -132,11 +132,11 @@ class Log:
         """Return the name of the topic that positions are taken from; None where there is none.
 
         Args:
-            name: the topic's, or "none". None is the only one of NavSatFix or, without any of that
-                type, the only one of odometry or poses; of several a note lists them.
+            name: the topic's name, or "none". None takes the only one of NavSatFix or, without any
+                of that type, the only one of odometry or poses; a note lists them if several.
 
         Raises:
-            InputError: the log has no such topic, or it is not of positions.
+            InputError: the log has no such topic, or it has no positions.
         """
         fixes, poses = self._topics(_FIXES), self._topics(_POSES)
         if name == "none":
@@ -170,7 +170,7 @@ class Log:
         """Yield the stamp and the pixels of every image of a topic, in the log's order.
 
         Args:
-            topic: as of `image_topic`.
+            topic: see `image_topic`.
 
         Raises:
             InputError: what `image_topic` raises; or an image or the log cannot be read.
@@ -181,7 +181,7 @@ class Log:
             yield stamp, decode_message(message, str(FrameName(str(self.path), name, stamp)))
 
     def stamps(self, topic: str) -> Int64[np.ndarray, " n"]:
-        """Return the stamps of a topic's images, in order, each once; notes say what was not so.
+        """Return the stamps of a topic's images, sorted, each once; notes report any that were not.
 
         Raises:
             InputError: the log cannot be read.
@@ -205,12 +205,12 @@ class Log:
         return decode_message(message, name, enough=enough)
 
     def positions(self, topic: str | None = None) -> Track | None:
-        """Read positions along time; None where the log has none.
+        """Read positions over time; None if the log has none.
 
         Messages without a fix, or with numbers that are not finite, are left out.
 
         Args:
-            topic: as of `position_topic`.
+            topic: see `position_topic`.
 
         Raises:
             InputError: what `position_topic` raises, no position in the topic, or the log cannot be
@@ -232,7 +232,7 @@ class Log:
         return Track(f"{self.path}#{name}", AXES[1 if is_fix else 2], times / 10**9, points)
 
     def scan(self, *topics: str) -> None:
-        """Read stamps and positions of topics in one pass for all; later calls need none.
+        """Read stamps and positions of all topics in one pass; later calls need no other.
 
         Raises:
             InputError: the log cannot be read.
@@ -259,7 +259,7 @@ class Log:
             return self._known[topic]
 
     def _ordered(self, topic: str, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sort stamps, and leave out those that were there before."""
+        """Sort stamps, and leave out repeated ones."""
         ordered, numbers = np.unique(stamps, return_index=True)
         back = -np.diff(stamps)[np.diff(stamps) < 0]
         if len(back):
@@ -275,9 +275,9 @@ class Log:
         return ordered, numbers
 
     def _message(self, topic: str, number: int, logged: np.ndarray) -> Any:
-        """Read a message, forwards from the last one where it is not far ahead."""
+        """Read a message, forwards from the last one if it is not far ahead."""
         time, (of, start) = int(logged[number]), self._begun
-        self._begun = ("", 0)  # a stream that fails is left
+        self._begun = ("", 0)  # a stream that fails is not used again
         forwards = of == topic and time >= start and number >= self._next
         if not forwards or time > logged[self._next] + _FAR:
             numbers, start = np.flatnonzero(logged >= time).tolist(), time
@@ -308,7 +308,7 @@ def open_log(path: str | os.PathLike[str]) -> Log:
         path: a ROS 1 bag (.bag), or a ROS 2 bag: a file .mcap or .db3, or its folder.
 
     Raises:
-        InputError: no such file, one that is not whole, or the extra `robot` is not installed.
+        InputError: no such file, an incomplete one, or the extra `robot` is not installed.
     """
     path = pathlib.Path(path)
     if not path.is_dir():
@@ -320,18 +320,18 @@ def open_log(path: str | os.PathLike[str]) -> Log:
 
 @functools.lru_cache(maxsize=_OPEN)
 def _as_of(path: str, size: int | None, changed: int) -> Log:
-    """Open a log of this size and time of change."""
+    """Open a log; its size and time of change are part of the cache's key."""
     return Log(path)
 
 
 @contextlib.contextmanager
 def _reader(path: pathlib.Path) -> Iterator[Any]:
-    """Open a reader of a log; whatever is wrong with the file becomes an InputError."""
+    """Open a reader of a log; any error in the file becomes an InputError."""
     try:
         from rosbags import rosbag1, rosbag2
     except ModuleNotFoundError as error:
         raise InputError(missing_extra(error, str(path))) from error
-    # Of a damaged file, rosbags raises what its parsers, decompressors and SQLite do.
+    # For a damaged file, rosbags raises whatever its parsers, decompressors and SQLite raise.
     try:
         with (rosbag1 if path.suffix.lower() == ".bag" else rosbag2).Reader(path) as reader:
             yield reader
@@ -347,7 +347,7 @@ def _reader(path: pathlib.Path) -> Iterator[Any]:
 
 @functools.cache
 def _typestore(is_ros1: bool) -> Any:
-    """Return what reads a message of a type of ROS 1 or 2; the common types are in all releases."""
+    """Return the decoder of ROS 1 or ROS 2 messages; the common types are in all releases."""
     from rosbags.typesys import Stores, get_typestore
 
     if is_ros1:
@@ -375,19 +375,19 @@ def _position(message: Any) -> tuple[float, float] | None:
 def decode_message(
     message: Any, name: str = "message", *, enough: tuple[int, int] | None = None
 ) -> np.ndarray:
-    """Decode an image message of ROS as `read_pixels` decodes a file.
+    """Decode a ROS image message as `read_pixels` decodes a file.
 
     Args:
-        message: sensor_msgs/Image or CompressedImage, of rosbags or of rclpy.
-        name: what messages begin with.
-        enough: as of `read_image`.
+        message: sensor_msgs/Image or CompressedImage, from rosbags or rclpy.
+        name: prefix of error messages.
+        enough: see `read_image`.
 
     Returns:
-        RGB, or grey (height, width), of 8 bits, or of what `mono16` and such have.
+        RGB, or grey (height, width), of 8 bits, or of the depth of encodings such as `mono16`.
 
     Raises:
-        InputError: an encoding that is unknown, fewer bytes than the image needs, or compressed
-            data that does not decode.
+        InputError: an unknown encoding, fewer bytes than the image needs, or compressed data that
+            does not decode.
 
     Example:
         >>> import types
@@ -426,7 +426,7 @@ def name_log_frame(frame: FrameName) -> pathlib.Path:
     """Name a log's frame by its own stamp: the first at or after the frame's time.
 
     Returns:
-        The name. A time behind the last frame stays, for the reader to report.
+        The name. A time after the last frame stays, for the reader to report.
 
     Raises:
         InputError: the log cannot be read, or has no such topic.
@@ -439,13 +439,13 @@ def name_log_frame(frame: FrameName) -> pathlib.Path:
 
 
 class ListedFrames(NamedTuple):
-    """Frames that were taken of a log."""
+    """Frames that were taken from a log."""
 
     paths: list[pathlib.Path]
     there: int
     """Number of all frames of the topic."""
     positions: Positions | None
-    """By the paths."""
+    """By path."""
 
 
 def list_log_frames(
@@ -455,13 +455,13 @@ def list_log_frames(
     topic: str | None = None,
     position_topic: str | None = None,
 ) -> ListedFrames:
-    """List the images of a log that are nearest after each 1 / fps seconds, with their positions.
+    """List a log's first image at or after each multiple of 1 / fps seconds, with its position.
 
     Args:
         path: the log.
-        fps: as of `list_frames`, counted from the first image.
-        topic: as of `Log.image_topic`.
-        position_topic: as of `Log.position_topic`.
+        fps: see `list_frames`; counted from the first image.
+        topic: see `Log.image_topic`.
+        position_topic: see `Log.position_topic`.
 
     Raises:
         InputError: the log cannot be read; what `image_topic` and `position_topic` raise.

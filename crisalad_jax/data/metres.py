@@ -1,8 +1,8 @@
-"""Convert between degrees, metres of a zone of UTM, and points on the ellipsoid.
+"""Convert between degrees, metres of a UTM zone, and points on the ellipsoid.
 
 The projection is Krueger's series (1912) of third order in the third flattening, as in Karney,
 Transverse Mercator with an accuracy of a few nanometers (J. Geodesy 2011), eqs. 35 and 36. It is
-exact to a millimetre in a zone and its neighbours.
+accurate to a millimetre in a zone and its neighbours.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _SQUARE = _FLATTENING * (2 - _FLATTENING)
 """Its first eccentricity, squared."""
 _THIRD = _FLATTENING / (2 - _FLATTENING)
 _RADIUS = 0.9996 * (_EQUATOR / (1 + _THIRD) * (1 + _THIRD**2 / 4 + _THIRD**4 / 64))
-"""Metres of a meridian's arc of one radian on the mean, times UTM's scale."""
+"""Mean length in metres of one radian of a meridian, times UTM's scale."""
 _FORWARD = (
     _THIRD / 2 - 2 * _THIRD**2 / 3 + 5 * _THIRD**3 / 16,
     13 * _THIRD**2 / 48 - 3 * _THIRD**3 / 5,
@@ -43,7 +43,7 @@ class Zone(NamedTuple):
     south: bool
 
     def __str__(self) -> str:
-        """Return words for a message, such as 32 north."""
+        """Describe the zone for a message, such as 32 north."""
         return f"{self.number} {'south' if self.south else 'north'}"
 
     @property
@@ -57,7 +57,7 @@ class Zone(NamedTuple):
         return latitude, (self.central + turn + 180) % 360 - 180
 
     def to_metres(self, latitude: _Points, longitude: _Points) -> tuple[_Points, _Points]:
-        """Compute east and north in metres in this plane, also of places outside of the zone."""
+        """Compute east and north in metres in this plane, also for places outside the zone."""
         turn = (longitude - self.central + 180) % 360 - 180
         east, north = transverse_mercator(latitude, turn)
         return east, north + _FALSE_NORTH * self.south
@@ -111,9 +111,9 @@ def _inverse(east: _Points, north: _Points) -> tuple[_Points, _Points]:
 
 
 def comparable(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "point axis"]:
-    """Make points in metres whose straight distances are those on the ground.
+    """Compute points in metres whose straight-line distances are those on the ground.
 
-    They are east and north where all are of one zone of UTM, else `on_ellipsoid`.
+    They are east and north if all are in one UTM zone, else `on_ellipsoid`.
     """
     longitude = continuous(longitude)
     if len(np.unique(np.floor(longitude / 6))) == 1:
@@ -122,9 +122,9 @@ def comparable(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "po
 
 
 def on_ellipsoid(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "point 3"]:
-    """Compute points in metres from the Earth's centre: a chord is their distance anywhere.
+    """Compute points in metres from the Earth's centre, whose distances are chords.
 
-    A chord of 1 km is 1 micrometre shorter than the way on the ground, one of 1000 km 1 km.
+    A chord of 1 km is 1 micrometre shorter than the distance on the ground, one of 1000 km 1 km.
     """
     phi, turn = np.deg2rad(latitude), np.deg2rad(longitude)
     radius = _EQUATOR / np.sqrt(1 - _SQUARE * np.sin(phi) ** 2)
@@ -135,7 +135,7 @@ def on_ellipsoid(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "
 
 
 def flattened(points: Float64[np.ndarray, "point axis"]) -> Float64[np.ndarray, "point 2"]:
-    """Return points as a map draws them: east and north as they are, others equirectangular."""
+    """Return points as a map draws them: east and north unchanged, others equirectangular."""
     if points.shape[1] == 2:
         return points
     x, y, z = points.T

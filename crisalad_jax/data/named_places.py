@@ -1,10 +1,10 @@
-"""Find training places: of GSV-Cities, of a folder or a table, or by position or order.
+"""Find training places in GSV-Cities, a folder or a table, or by position or order.
 
 GSV-Cities (Ali-bey et al. 2022) has `Dataframes/{city}.csv` with one row per image, which is
 `Images/{city_id}/{city_id}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}.jpg`.
 
-No two images of one batch are negatives of each other while they are as near as two images of one
-place may be: places that are too near for that are listed as such, and do not meet in a batch.
+Two images of a batch are never negatives if they are as close as two images of one place may be:
+places that are too close for that are listed as `near` each other, and never share a batch.
 """
 
 import collections
@@ -33,7 +33,7 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int64
 
 COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
-"""Of a table of GSV-Cities."""
+"""Columns of GSV-Cities' tables."""
 _IDS_PER_CITY = 10**5
 TABLE = "places.csv"
 _COLUMNS = "name,place[,lat,lon[,heading]][,city]"
@@ -42,10 +42,10 @@ _LAYOUTS = (
 )
 _GROUPED = "--place-radius METRES makes places by positions, --place-frames N of images in order"
 _VIEW = ("lat", "lon", "heading")
-"""Columns of where an image was taken."""
+"""Columns for where an image was taken."""
 _APART = 4
-"""Radii between the centres of two places of a batch, at least. Images of one place are at most two
-radii apart, and so those of two places are no nearer."""
+"""Smallest distance between the centres of two places of a batch, in radii. Images of one place are
+at most two radii apart, and those of two places at least two."""
 
 View = Sequence[float]
 """Latitude, longitude and heading of an image, NaN where it has no heading."""
@@ -58,16 +58,16 @@ class FoundPlace(NamedTuple):
     images: Mapping[str, View | None]
     """Path relative to the root -> the view; None where positions are unknown."""
     near: Sequence[int] = ()
-    """Numbers of the places that are too near to be in a batch with it."""
+    """Indices of places that are too close to share a batch with it."""
     city: int = 0
 
 
 def read_gsv_cities(
     root: pathlib.Path, cities: Sequence[str] | None, on_bad_image: OnBadImage
 ) -> tuple[tuple[str, ...], list[FoundPlace]]:
-    """Return the cities, and their places ascending by id.
+    """Return the cities, and their places sorted by id.
 
-    Images may end in .jpg or .JPG, and may lie in a folder named by the city id or by the CSV file.
+    Images may end in .jpg or .JPG, and may be in a folder named after the city id or the CSV file.
 
     Raises:
         InputError: a city that is unknown or named twice, a bad row, or a row without its image.
@@ -148,8 +148,8 @@ def read_msls_places(
 ) -> tuple[tuple[str, ...], list[FoundPlace]]:
     """Return the cities of raw MSLS, and their places: the clusters of its tables.
 
-    By default the cities are those of its training set. Images of the database and of the queries
-    are of one place; panoramas are left out.
+    By default the cities are those of its training set. A place has images of both the database and
+    the queries; panoramas are left out.
 
     Raises:
         InputError: there are no such cities, or what `read_msls` raises.
@@ -173,14 +173,14 @@ def read_msls_places(
 def read_named_places(
     root: pathlib.Path, on_bad_image: OnBadImage
 ) -> tuple[pathlib.Path, tuple[str, ...], list[FoundPlace]]:
-    """Read a table, a folder with a table in it, or a folder with one folder a place.
+    """Read a table, a folder with a table in it, or a folder with one subfolder per place.
 
     Returns:
         The folder that the images' paths are relative to, the cities that the table names, and the
-        places, in the order of these.
+        places, ordered by city.
 
     Raises:
-        InputError: it is none of these; what the table says does not fit; or an image is missing.
+        InputError: it is none of these, the table is not valid, or an image is missing.
     """
     if is_file(root / TABLE):
         root = root / TABLE
@@ -212,7 +212,7 @@ def _read_table(
     """Read the cities and places of a table; under "skip" a note counts the missing images."""
     table = read_table(path, "name", any_spelling=True)
     given = [column for column in _VIEW if column in table.columns]
-    # A heading is of use with a position alone.
+    # A heading is only useful with a position.
     if "place" not in table.columns or given not in ([], ["lat", "lon"], [*_VIEW]):
         raise InputError(
             f"{path}: found columns {', '.join(table.columns)}, expected {_COLUMNS}; {_GROUPED}"
@@ -245,16 +245,16 @@ def _read_table(
 def places_by_position(
     source: ImageSource, radius: float, positions: str | os.PathLike[str] | None
 ) -> list[FoundPlace]:
-    """Group images into places of a radius, each called by the name of the image at its centre.
+    """Group images into places of a radius, each named after the image at its centre.
 
     In the order of the images, one that is farther than the radius from all centres becomes a
-    centre. Then every image is of the place with the nearest centre.
+    centre. Then every image joins the place with the nearest centre.
 
     Args:
         source: the images.
         radius: in metres.
-        positions: a table (`read_image_table`) or track (`read_track`); None is what the source
-            says, if that is a table, else what @UTM names say, else the EXIF data of JPEGs.
+        positions: a table (`read_image_table`) or track (`read_track`); None takes those of the
+            source if it is a table, else those in @UTM names, else the EXIF data of JPEGs.
 
     Raises:
         InputError: no image has a position, or what `positions_of` raises.
@@ -286,9 +286,9 @@ def places_by_position(
 
 
 def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
-    """Make a place of every so many images of a folder or video in order, called by the first one.
+    """Make a place of each `frames` consecutive images of a folder or video, named after the first.
 
-    A place and the next one of the same folder or video are too near for one batch.
+    Consecutive places of one folder or video are too close to share a batch.
     """
     places: list[FoundPlace] = []
     for sequence in by_sequence(source.paths):
@@ -305,7 +305,7 @@ def _divide(
     points: Float64[np.ndarray, "images axis"], radius: float
 ) -> tuple[list[int], Int64[np.ndarray, " images"], list[list[int]]]:
     """Return the images at the centres, each image's place, and the places near each place."""
-    from scipy.spatial import KDTree  # takes a fifth of a second, which few readers need
+    from scipy.spatial import KDTree  # the import takes a fifth of a second
 
     tree = KDTree(points)
     centres: list[int] = []

@@ -1,4 +1,4 @@
-"""Training places in the layout of GSV-Cities, of your own, or made of positions or an order."""
+"""Training places in GSV-Cities' or a custom layout, or made from positions or an order."""
 
 import dataclasses
 import functools
@@ -55,7 +55,7 @@ class Places:
     views: Float64[np.ndarray, "images 3"] | None = None
     """Image -> latitude, longitude and heading, NaN where it has no heading."""
     near: tuple[Int64[np.ndarray, " _"], ...] | None = None
-    """Place -> other places that are too near to be in a batch with it; None where any two may."""
+    """Place -> other places that are too close to share a batch with it; None if any two may."""
 
     @property
     def image_counts(self) -> Int64[np.ndarray, " places"]:
@@ -74,13 +74,13 @@ class Places:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class JoinedPlaces:
-    """The images of several training sets, numbered from one set to the next."""
+    """The images of several training sets, numbered consecutively."""
 
     sets: tuple[Places, ...]
 
     @functools.cached_property
     def starts(self) -> Int64[np.ndarray, " sets+1"]:
-        """Number of each set's first image, and of all images."""
+        """Index of each set's first image, and the number of all images."""
         return np.cumsum([0, *(len(each.files) for each in self.sets)], dtype=np.int64)
 
     @property
@@ -107,49 +107,49 @@ def read_places(
     topic: str | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> Places:
-    """Read a folder in the layout of GSV-Cities, of MSLS or of your own.
+    """Read training places from a folder in the layout of GSV-Cities or MSLS, or in a custom one.
 
-    Or make places of any source of images, by their positions or their order. Then places that are
-    too near to tell apart, `Places.near`, never meet in a batch.
+    Or make places from any source of images, by their positions or their order. Then places that
+    are too close to tell apart (`Places.near`) never share a batch.
 
-    A layout of your own is a folder in which each folder with images is a place; or a table with
-    the columns `name,place`, and `lat,lon` and `heading` in degrees and `city` where they are
-    known: a file, or `places.csv` in the folder. Names are relative to the table. A table of
-    several cities, or scenes, has the places of each by their own names.
+    A custom layout is a folder in which each folder with images is a place; or a table with the
+    columns `name,place` and, if known, `lat,lon`, `heading` (all in degrees) and `city`: a file, or
+    `places.csv` in the folder. Names are relative to the table. With several cities, or scenes, in
+    a table, names of places only need to be unique within each.
 
     Places of MSLS are the clusters of its tables (`unique_cluster`), with the images of the
     database and of the queries, without panoramas.
 
-    GSV-Cities' images may end in .jpg or .JPG, and may lie in a folder named by the city id or by
-    the CSV file. A row that repeats an earlier one of its place is dropped: no picture is its own
-    second view.
+    GSV-Cities' images may end in .jpg or .JPG, and may be in a folder named after the city id or
+    the CSV file. A row that repeats an earlier one of its place is dropped, so that no image is its
+    own second view.
 
     Args:
-        root: folder that holds `Dataframes/` and `Images/`, or a layout of your own, here or at an
+        root: folder that holds `Dataframes/` and `Images/`, or a custom layout, local or at an
             address such as s3://bucket/places (not MSLS); with `place_radius` or `place_frames` a
             source of images (`open_source`).
-        cities: names of CSV files without the suffix, or of MSLS's folders; None reads all, of MSLS
-            those of its training set.
+        cities: names of CSV files without the suffix, or of MSLS's folders; None reads all, or for
+            MSLS those of its training set.
         min_images: places with fewer images are left out, and a note counts them.
-        place_radius: metres from a place's centre, within which its images are. In the order of the
-            images, one that is farther from all centres becomes a centre; then each image is of the
-            place with the nearest. Centres of a batch are more than four radii apart.
-        place_frames: number of consecutive images of a folder, or frames of a video, that are a
-            place. The next place is not in a batch with it.
+        place_radius: radius of a place in metres. In the order of the images, one that is farther
+            than this from all centres becomes a centre; then each image joins the place with the
+            nearest centre. Centres in a batch are more than four radii apart.
+        place_frames: number of consecutive images of a folder, or frames of a video, that make a
+            place. Consecutive places never share a batch.
         positions: table or track of positions for `place_radius` (`read_image_table`,
-            `read_track`). None is what the source says, if that is a table or a robot log, else
-            what @UTM names say, else the EXIF data of JPEGs.
-        fps: frames a second taken of videos and logs; None is one.
-        topic: the topic of images in a robot log; None is the only one.
-        on_bad_image: "stop" where an image that a table names is missing, or "skip" it.
+            `read_track`). None takes those of the source if it is a table or a robot log, else
+            those in @UTM names, else the EXIF data of JPEGs.
+        fps: frames per second to take from videos and logs; None takes one.
+        topic: the topic of images in a robot log; None takes the only one.
+        on_bad_image: "stop" if an image that a table names is missing, or "skip" it.
 
     Returns:
-        The places, with their images' files.
+        The places, with their image files.
 
     Raises:
         InputError: none of these layouts, an unknown or repeated city, a CSV without a column or
             with a field that is not a number, a missing image, no place large enough, no position,
-            or arguments that do not fit each other.
+            or arguments that do not go together.
 
     Example:
         >>> read_places(places, min_images=3).image_counts.tolist()
@@ -187,10 +187,10 @@ def read_places(
 
 
 def check_grouping(place_radius: float | None, place_frames: int | None) -> None:
-    """Check what makes places of images; see `read_places`.
+    """Check the arguments that group images into places; see `read_places`.
 
     Raises:
-        InputError: no distance, or fewer than two frames.
+        InputError: the radius is not a distance, or fewer than two frames.
     """
     if place_radius is not None and not 0 < place_radius < math.inf:
         raise InputError(f"--place-radius: found {place_radius:g}, expected metres above 0")
@@ -206,13 +206,13 @@ def group_images(
     *,
     min_images: int = 1,
 ) -> Places:
-    """Make places of a source's images, by their positions or their order, or one of each image.
+    """Make places from a source's images, by position or order, or one place per image.
 
     Args:
         source: the images.
-        place_radius: see `read_places`, as of what follows.
+        place_radius: see `read_places`, also for the arguments below.
         place_frames: number of consecutive images.
-        positions: table or track; None is what the source says.
+        positions: table or track; None takes those of the source.
         min_images: places with fewer images are left out.
 
     Raises:
@@ -230,7 +230,7 @@ def group_images(
 def _places(
     root: pathlib.Path, cities: tuple[str, ...], found: Sequence[FoundPlace], min_images: int
 ) -> Places:
-    """Make arrays of the places that are large enough."""
+    """Make `Places` from those that are large enough."""
     large = {i: place for i, place in enumerate(found) if len(place.images) >= min_images}
     if not large:
         most = max((len(place.images) for place in found), default=0)

@@ -24,10 +24,10 @@ from crisalad_jax.utils.shapes import Float64
 _BANDS = "CDEFGHJKLMNPQRSTUVWX"
 """Letters of UTM's bands of latitude, from south to north; N is the first of the north."""
 _BAND_S = (3.4e6, 4.6e6)
-"""Northings of band S, 32 to 40 degrees, with a margin; elsewhere S stands for the south."""
+"""Northings of band S, 32 to 40 degrees, with a margin; elsewhere S means south."""
 _NEAR = 9.0
-"""Degrees from a zone's central meridian, its neighbours included, within which its plane has
-distances right to about one percent."""
+"""Degrees from a zone's central meridian, neighbouring zones included, within which distances in
+its plane are correct to about one percent."""
 
 
 @brief
@@ -37,10 +37,10 @@ class Positions(NamedTuple):
     axes: tuple[str, str]
     of: dict[str, tuple[float, float]]
     zone: Zone | None = None
-    """The zone of east and north; None where it is unknown, and of other axes."""
+    """The zone of east and north; None if it is unknown, and for other axes."""
 
     def check(self) -> None:
-        """Raise InputError for other axes, or where a position is not two numbers in range."""
+        """Raise InputError for unknown axes, or if a position is not two numbers in range."""
         if self.axes not in AXES:
             raise InputError(f"positions: found axes {self.axes}, expected one of {AXES}")
         for name, at in self.of.items():
@@ -62,8 +62,8 @@ class Positions(NamedTuple):
 
         Args:
             source: the map, for messages.
-            axes: the map's; None where it has no position yet.
-            zone: the map's; None where it is unknown.
+            axes: the map's axes; None if it has no position yet.
+            zone: the map's zone; None if unknown.
 
         Raises:
             InputError: what `check` raises; other axes without a known zone, or a place far from
@@ -109,11 +109,11 @@ def utm_position(name: str) -> tuple[float, float] | None:
 def utm_zones(names: Sequence[str]) -> list[Zone | None]:
     """Read the zone of each `@UTM_east@UTM_north@zone@letter@...` name.
 
-    The letter is that of the band of latitude, or else N or S for the hemisphere. Where no two
-    names contradict each other, all have the same zone; None where it is unknown.
+    The letter is that of the band of latitude, or else N or S for the hemisphere. If no two names
+    contradict each other, all get the same zone; None if it is unknown.
 
     Args:
-        names: of images with a `utm_position`; paths too.
+        names: names or paths of images with a `utm_position`.
 
     Raises:
         InputError: several zones or hemispheres, and a name without one.
@@ -149,7 +149,7 @@ def utm_degrees(
     """Compute latitude and longitude of images whose zones are all known.
 
     Raises:
-        InputError: metres that no place has.
+        InputError: metres out of range.
     """
     degrees = np.empty_like(metres)
     off = (np.abs(metres - [5e5, 5e6]) > [1e6, 5.1e6]).any(axis=1)
@@ -166,10 +166,10 @@ def utm_degrees(
 def utm_positions(names: Sequence[str]) -> Positions:
     """Read the positions of the images with names `@UTM_east@UTM_north@zone@letter@...`.
 
-    They are east and north in metres or, where the images are of several zones, degrees.
+    They are east and north in metres or, if the images are of several zones, degrees.
 
     Raises:
-        InputError: several zones, and a name without its zone or with metres that no place has.
+        InputError: several zones, and a name without its zone or with metres out of range.
     """
     found = ((name, utm_position(name.rpartition("/")[2])) for name in names)
     of = {name: position for name, position in found if position is not None}
@@ -190,9 +190,9 @@ def positions_of(
     """Return given positions, or those of a file, under the names that images have on disk.
 
     Args:
-        given: by name, or a table's file, which has a position in every row; names of other images
-            stay in it. Or by time: a track or its file (`read_track`).
-        names: of the images.
+        given: positions by name, or the file of a table with a position in every row; names of
+            other images stay. Or positions by time: a track or its file (`read_track`).
+        names: names of the images.
         paths: their files.
         images: where these are, for messages.
 
@@ -224,7 +224,7 @@ def _along(
     paths: Sequence[pathlib.Path],
     images: str | os.PathLike[str],
 ) -> Positions:
-    """Interpolate the positions of images along a track, and say in notes how many have any.
+    """Interpolate the positions of images along a track; a note counts the images that have one.
 
     Raises:
         InputError: none was taken between the track's ends; or what `_times` raises.
@@ -263,8 +263,7 @@ def _times(
     """Read when images were taken: a time in the name, or else in EXIF data.
 
     Returns:
-        Seconds since 1970, NaN where nothing says any; and how many are local times of an unknown
-        zone.
+        Seconds since 1970, NaN if unknown; and how many are local times of an unknown zone.
 
     Raises:
         InputError: frames of a video without a start, or of several videos; or no image has a time.
@@ -296,11 +295,11 @@ def _times(
 def read_image_table(
     path: str | os.PathLike[str], *, all_positions: bool = False
 ) -> tuple[list[str], Positions | None]:
-    """Read a table with a column `name`, and perhaps a position: east,north or lat,lon or x,y.
+    """Read a table with a column `name`, and optionally positions: east,north or lat,lon or x,y.
 
     Columns may be in capitals, or have other usual names, such as filename and latitude. Decimals
-    may have commas where semicolons separate the fields. x and y count only where there is neither
-    of the other pairs. A row whose two numbers are both empty has no position. Other columns are
+    may have commas if semicolons separate the fields. x and y count only if there is neither of the
+    other pairs. A row whose two coordinates are both empty has no position. Other columns are
     ignored.
 
     Args:
@@ -349,8 +348,8 @@ def _exif(path: str | os.PathLike[str] | BinaryIO, group: int) -> dict[int, Any]
 
 
 def exif_position(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, float] | None:
-    """Read latitude and longitude in degrees; None where a file says none that can be right."""
-    # EXIF data of any maker may be wrong in any way, and then tells nothing.
+    """Read latitude and longitude in degrees; None if a file has none that are valid."""
+    # EXIF data of any maker may be wrong in any way, and is then ignored.
     with contextlib.suppress(Exception):
         fields = _exif(path, _GPS)
         if fields.get(_STATUS) == _VOID:
@@ -367,7 +366,7 @@ def exif_time(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, bool] | N
 
     Returns:
         Seconds since 1970, and whether their zone is known; without one they are taken as UTC.
-        None where a file says no time that can be right.
+        None if a file has no valid time.
     """
     with contextlib.suppress(Exception):
         fields = _exif(path, _EXIF)
@@ -379,17 +378,17 @@ def exif_time(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, bool] | N
 
 
 def _degrees(fields: dict[int, Any], reference: int, value: int, signs: bytes) -> float:
-    """Return degrees of degrees, minutes and seconds; NaN where a fraction is 0 / 0."""
+    """Convert degrees, minutes and seconds to degrees; NaN if a fraction is 0 / 0."""
     degrees, minutes, seconds = (float(part) for part in fields[value])
     sign = 1 - 2 * signs.decode().index(fields[reference].strip("\0 ").upper())
     return sign * (degrees + minutes / 60 + seconds / 3600)
 
 
 def exif_positions(images: Iterable[tuple[str, pathlib.Path]]) -> Positions:
-    """Read the positions of images that have any.
+    """Read the EXIF positions of images, for those that have one.
 
     Args:
-        images: the name and the file of each.
+        images: the name and file of each.
     """
     each = list(images)
     found = for_each(exif_position, [path for _, path in each])

@@ -1,4 +1,4 @@
-"""Prepare a decoded photograph for a network: 8 bits of RGB, resized, and normalised if floats."""
+"""Prepare a decoded photograph for a network: 8-bit RGB, resized, and normalised if floats."""
 
 import dataclasses
 import threading
@@ -20,12 +20,12 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, UInt8, UInt16
 
 PERCENTILES = (1, 99)
-"""Of an image's values, between which "contrast-stretch" spreads them. A dead pixel of a thermal
-camera would take the whole range."""
+"""Percentiles of an image's values, between which "contrast-stretch" spreads them. With the
+extremes, a dead pixel of a thermal camera would use up the range."""
 _NARROW = 2**14
-"""Range of 16-bit values below which an image has less than 64 of 256 grey levels."""
+"""Range of 16-bit values below which an image has fewer than 64 of 256 grey levels."""
 _noted = threading.Lock()
-"""Taken for good by the first note: a set of thermal images has thousands of them."""
+"""Acquired for good by the first note: a set of thermal images would give thousands."""
 
 
 def as_rgb(
@@ -37,7 +37,7 @@ def as_rgb(
         image: RGB (height, width, 3), or grey (height, width) or (height, width, 1). uint8 or
             uint16; for "contrast-stretch" any integers or floats.
         bit_depth: how more than 8 bits become 8; see `PreprocessingConfig`.
-        name: what messages begin with, such as the file.
+        name: prefix of messages, such as the file.
 
     Raises:
         InputError: it is not such an array, or none of its values is finite.
@@ -69,7 +69,7 @@ def as_rgb(
 
 
 def _range(image: np.ndarray, name: str) -> tuple[float, float]:
-    """Return `PERCENTILES` of the values that are finite: values, so that grey and RGB agree."""
+    """Return `PERCENTILES` of the finite values, uninterpolated so that grey and RGB agree."""
     values = image[np.isfinite(image)] if image.dtype.kind == "f" else image
     if not values.size:
         raise InputError(f"{name}: found no finite value, expected some")
@@ -78,14 +78,14 @@ def _range(image: np.ndarray, name: str) -> tuple[float, float]:
 
 
 def _stretched(image: np.ndarray, name: str) -> UInt8[np.ndarray, "..."]:
-    """Spread the values between the percentiles over 0 to 255; what is not finite becomes 0."""
+    """Spread the values between the percentiles over 0 to 255; NaN becomes 0."""
     low, high = _range(image, name)
     share = (image - np.float64(low)) / ((high - low) or 1.0)
     return np.rint(255 * np.clip(np.nan_to_num(share), 0, 1)).astype(np.uint8)
 
 
 def _note_narrow(image: UInt16[np.ndarray, "..."], name: str) -> None:
-    """Say, once, that 16-bit values of a narrow range lose most of what they show."""
+    """Warn, once, that 16-bit values of a narrow range lose most of their detail."""
     if _noted.locked():
         return
     low, high = _range(image, name)
@@ -99,20 +99,20 @@ def _note_narrow(image: UInt16[np.ndarray, "..."], name: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Preparation:
-    """All that decides how photographs are prepared; caches keep images by it."""
+    """Everything that determines how photographs are prepared; caches use it as a key."""
 
     image_size: Size
     preprocessing: PreprocessingConfig = PreprocessingConfig()
     side_multiple: int = 1
-    """Number of pixels that sides are rounded to multiples of; see `ModelConfig.side_multiple`."""
+    """Sides are rounded to multiples of this many pixels; see `ModelConfig.side_multiple`."""
     check_size: Callable[[Size], None] | None = dataclasses.field(
         default=None, compare=False, repr=False
     )
     """Raises InputError for a height and width that the model cannot describe."""
     local_features: LocalFeatures | None = None
-    """What photographs become in place of pixels, if anything."""
+    """Local features that replace the pixels, if any."""
     encoded_size: Size | None = None
-    """Height and width of the bytes of local features."""
+    """Height and width of the encoded local features."""
 
     def __post_init__(self) -> None:
         """Check the size."""
@@ -123,7 +123,7 @@ class Preparation:
 
     @classmethod
     def of(cls, model: Any) -> Self:
-        """Return how the photographs of a model are prepared, as its configuration says."""
+        """Return the preparation that a model's configuration specifies."""
         return cls(
             model.image_size,
             model.preprocessing,
@@ -135,11 +135,11 @@ class Preparation:
 
     @property
     def dtype(self) -> type[np.generic]:
-        """Type of what is prepared: uint8 pixels, or float32 that are normalised."""
+        """Type of prepared images: uint8 pixels, or normalised float32."""
         return np.uint8 if self.preprocessing.pixels == "bytes" else np.float32
 
     def size_of(self, size: Size) -> Size:
-        """Return the height and width that an image of `size` gets."""
+        """Return the height and width of an image of `size` after preparation."""
         if self.encoded_size is not None:
             return self.encoded_size
         first = self.preprocessing.target_size(size, self.image_size)
@@ -150,13 +150,13 @@ class Preparation:
 
         Args:
             image: RGB or grey, as `as_rgb` takes it.
-            name: the image's, for messages.
+            name: the image's name, for messages.
 
         Returns:
             8-bit pixels, or normalised float32; or the bytes of local features.
 
         Raises:
-            InputError: the image is no array of pixels, or what `check_size` raises.
+            InputError: the image is not an array of pixels, or what `check_size` raises.
         """
         how = self.preprocessing
         image = as_rgb(image, how.bit_depth, name)
@@ -184,7 +184,7 @@ def normalised(pixels: Pixels, how: PreprocessingConfig) -> Float32[np.ndarray, 
 
     Args:
         pixels: RGB (..., 3), 8-bit or floats.
-        how: has the mean and the deviation, of pixels from 0 to 1.
+        how: its mean and deviation are for pixels from 0 to 1.
     """
     mean, deviation = (np.array(each, np.float32) for each in (how.mean, how.deviation))
     return (pixels / np.float32(255) - mean) / deviation

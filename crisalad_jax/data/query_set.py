@@ -1,4 +1,4 @@
-"""A training set of queries and a database, of which tuples are mined (NetVLAD, SelaVPR)."""
+"""A training set of queries and a database, from which tuples are mined (NetVLAD, SelaVPR)."""
 
 import dataclasses
 import functools
@@ -33,7 +33,7 @@ class QuerySet:
     positives: tuple[Int64[np.ndarray, " _"], ...]
     """Query -> database images that show its place, at least one, ascending."""
     near: tuple[Int64[np.ndarray, " _"], ...]
-    """Query -> database images that are no negatives, ascending; its positives are among them."""
+    """Query -> database images that are not negatives, ascending; includes its positives."""
 
     def path(self, image: int | np.integer) -> pathlib.Path:
         """Return the path of one image."""
@@ -52,11 +52,11 @@ def read_query_set(
     r"""Read the training split of a set that `open_benchmark` reads, such as pitts30k_train.mat.
 
     Args:
-        root: a folder or file; of a folder with several splits, `train` is taken.
+        root: a folder or file; from a folder with several splits, `train` is read.
         positive_radius: in metres, inclusive.
-        negative_radius: in metres; database images within it are no negatives.
+        negative_radius: in metres; database images within it are not negatives.
         images: the folder of the images that a file names.
-        on_bad_image: as of `open_benchmark`.
+        on_bad_image: see `open_benchmark`.
 
     Returns:
         The queries with at least one positive.
@@ -80,7 +80,7 @@ def read_query_set(
     read = functools.partial(open_benchmark, root, split, images=images, on_bad_image=on_bad_image)
     radii = (positive_radius, negative_radius)
     if raw_msls:
-        # Images of different cities match in no radius, whatever their positions.
+        # Images of different cities never match, whatever their positions.
         benchmark, wider = map(read, radii)
         positives, near = benchmark.ground_truth(), wider.ground_truth()
     else:

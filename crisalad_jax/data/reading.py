@@ -28,22 +28,22 @@ def image_batches(
 
     Args:
         paths: image files.
-        image_size: height and width in pixels that images are resized to, or what the rule of
-            `preprocessing` takes from them.
-        batch_size: number of images of a batch.
+        image_size: height and width in pixels that images are resized to, or from which the size
+            rule of `preprocessing` computes the size.
+        batch_size: number of images in a batch.
         preprocessing: how images are resized, and floats normalised.
-        side_multiple: number of pixels that sides are rounded to multiples of.
+        side_multiple: sides are rounded to multiples of this number of pixels.
         check_size: raises InputError for a height and width that no image may have.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
-        threads: how many decode ahead; 0 decodes in the caller's thread.
-        cache: holds decoded images.
+        threads: number of threads that decode ahead; 0 decodes in the caller's thread.
+        cache: stores decoded images.
 
     Yields:
         The batches: pixels, indices into `paths`, and which images are valid.
 
     Raises:
-        InputError: at once for arguments out of range; while iterating under "stop" for an image
-            that cannot be read.
+        InputError: at once, for arguments out of range; while iterating, for an unreadable image
+            under "stop".
 
     Example:
         >>> paths = sorted(pictures.iterdir())

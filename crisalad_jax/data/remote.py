@@ -1,7 +1,7 @@
-"""Read images at addresses, such as s3://bucket/frames, with fsspec.
+"""Read remote images, at addresses such as s3://bucket/frames, with fsspec.
 
 A path holds an address as `pathlib` writes it, with one slash: `s3:/bucket/frames`. So names,
-patterns and folders are of paths everywhere, and only what touches files asks here.
+patterns and folders are paths everywhere, and only code that accesses files uses this module.
 """
 
 import contextlib
@@ -21,15 +21,15 @@ from crisalad_jax.utils.files import real_path
 
 _T = TypeVar("_T")
 AT_ONCE = 16
-"""Number of files at addresses that are read at a time: most of that is waiting."""
+"""Number of remote files to read at a time: reading is mostly waiting."""
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.I | re.S)  # C:/ is a drive
 _SECRET = re.compile(r"([^:]+://)[^/]*@([^?]*)|(https?://)([^?]*)\?", re.I)
 _HEADER = 2**16
-"""Bytes that are read at a time of a file's beginning, where EXIF data is."""
+"""Bytes to read at a time from the beginning of a file, where EXIF data is."""
 
 
 def is_remote(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path stands for an address.
+    """Return whether a path is a remote address.
 
     Example:
         >>> is_remote(pathlib.Path("s3://bucket/a.jpg")), is_remote("C:/a.jpg")
@@ -39,7 +39,7 @@ def is_remote(path: str | os.PathLike[str]) -> bool:
 
 
 def address_of(path: str | os.PathLike[str]) -> str:
-    """Return the address that a path stands for; other paths as they are.
+    """Return the address that a path stands for; other paths unchanged.
 
     Example:
         >>> address_of(pathlib.Path("s3://bucket/a.jpg"))
@@ -54,7 +54,7 @@ def whole_name(folder: pathlib.Path) -> str:
 
 
 def check_address(path: str | os.PathLike[str]) -> None:
-    """Check that an address has nothing secret, as names and messages repeat it.
+    """Check that an address contains no secrets, because names and messages repeat it.
 
     Raises:
         InputError: it has a user, or a query, which may be a signature.
@@ -69,7 +69,7 @@ def check_address(path: str | os.PathLike[str]) -> None:
 
 @functools.lru_cache
 def _file_system(root: str) -> Any:
-    """Return what reads a host or bucket: one for all threads, so that it lists a folder once."""
+    """Return a host's or bucket's file system: one for all threads, to list a folder only once."""
     import fsspec.core
 
     return fsspec.core.url_to_fs(root)[0]
@@ -77,11 +77,10 @@ def _file_system(root: str) -> Any:
 
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[Any, str]]:
-    """Yield the file system of an address and the path there; its errors become one line.
+    """Yield the file system of an address and the path in it; errors become one line.
 
     Raises:
-        InputError: what `check_address` raises; a package that is missing; or whatever else the
-            file system raises.
+        InputError: what `check_address` raises; a missing package; or any error of the file system.
     """
     check_address(path)
     address = address_of(path)
@@ -93,7 +92,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[Any, str]]:
         raise InputError(missing_extra(error, address)) from error
     except InputError:
         raise
-    except Exception as error:  # each file system has its own
+    except Exception as error:  # each file system raises its own errors
         reason = " ".join(str(error).split()) or type(error).__name__
         if isinstance(error, FileNotFoundError):
             reason = "found no such file"
@@ -112,7 +111,7 @@ def read_remote(path: str | os.PathLike[str]) -> bytes:
 
 @contextlib.contextmanager
 def open_beginning(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Open the file at an address to read its beginning alone.
+    """Open the file at an address to read only its beginning.
 
     Raises:
         InputError: it cannot be read.
@@ -122,10 +121,10 @@ def open_beginning(path: str | os.PathLike[str]) -> Iterator[Any]:
 
 
 def size_of(path: pathlib.Path) -> int | None:
-    """Return the bytes of the file that holds an image, here or at an address; None for no file.
+    """Return the size in bytes of a local or remote image's file; None if there is no file.
 
     Raises:
-        InputError: an address that cannot be asked.
+        InputError: an address cannot be accessed.
     """
     if is_remote(path):
         return _if_there(path, lambda files, there: files.info(there)["size"])
@@ -133,22 +132,22 @@ def size_of(path: pathlib.Path) -> int | None:
 
 
 def is_file(path: pathlib.Path) -> bool:
-    """Return whether there is a file, here or at an address; raises as `size_of`."""
+    """Return whether a local or remote file exists; raises as `size_of`."""
     if not is_remote(path):
         return path.is_file()
     return bool(_if_there(path, lambda files, there: files.info(there)["type"] == "file"))
 
 
 def is_folder(path: pathlib.Path) -> bool:
-    """Return whether there is a folder, at an address one that holds something; as `size_of`."""
+    """Return whether a folder exists (if remote, with something in it); raises as `size_of`."""
     return bool(list_names(path)) if is_remote(path) else path.is_dir()
 
 
 def list_names(folder: pathlib.Path) -> list[str]:
-    """List the names in a folder, here or at an address; an empty list if there is no folder.
+    """List the names in a local or remote folder; an empty list if there is no folder.
 
     Raises:
-        InputError: an address that cannot be asked.
+        InputError: an address cannot be accessed.
     """
     if not is_remote(folder):
         try:
@@ -165,10 +164,10 @@ def list_names(folder: pathlib.Path) -> list[str]:
 
 
 def state_of(path: pathlib.Path) -> str | None:
-    """Return a text that is another one when a file has changed; None where there is none.
+    """Return a text that changes when the file does; None if there is no file.
 
     Raises:
-        InputError: an address that cannot be asked.
+        InputError: an address cannot be accessed.
     """
     if not is_remote(path):
         with contextlib.suppress(OSError):
@@ -187,7 +186,7 @@ def _if_there(path: pathlib.Path, ask: Callable[[Any, str], _T]) -> _T | None:
 
 
 def for_each(work: Callable[[pathlib.Path], _T], paths: Sequence[pathlib.Path]) -> Iterable[_T]:
-    """Return the results of a function of files, of several at a time where they are far away."""
+    """Apply a function to files and return its results, with several at a time if remote."""
     if not any(map(is_remote, paths)):
         return map(work, paths)
     with ThreadPoolExecutor(AT_ONCE) as threads:
@@ -195,7 +194,7 @@ def for_each(work: Callable[[pathlib.Path], _T], paths: Sequence[pathlib.Path]) 
 
 
 def list_remote(path: pathlib.Path, pattern: pathlib.Path | None = None) -> list[pathlib.Path]:
-    """List the files below a folder at an address, or those of a pattern below it.
+    """List the files below a remote folder, or those below it that match a pattern.
 
     Raises:
         InputError: there is no such folder.

@@ -1,4 +1,4 @@
-"""Resize images as Pillow and torch do, compiled by numba: OpenCV has no antialiased filters."""
+"""Resize images as Pillow and torch do, with numba: OpenCV has no antialiased filters."""
 
 import functools
 import sys
@@ -29,28 +29,28 @@ def resize_image(
 
     By default the filter is bilinear, and antialiased where the image shrinks: a triangle two
     output pixels wide. Most public models were trained and evaluated with it, as Pillow's BILINEAR
-    and torchvision's Resize. The result equals Pillow's within one grey level, as that of "bicubic"
-    on bytes does. (OpenCV's INTER_AREA is a box filter, several times further from Pillow on
+    and torchvision's Resize. The result is within one grey level of Pillow's, and so is that of
+    "bicubic" on bytes. (OpenCV's INTER_AREA is a box filter, several times further from Pillow on
     photographs; its INTER_LINEAR aliases.) Floats equal torch's `interpolate` up to rounding, with
-    the antialias or without.
-    The first few images are resized by numpy, and so are all without numba, which the `train` extra
-    installs: the same bits, in ten times as long.
+    or without antialiasing.
+    The first few images are resized by numpy, as are all images if numba (the `train` extra) is
+    not installed: the result is bit-identical, but takes ten times as long.
 
     Args:
         image: 8-bit RGB; with "floats" also float32.
         image_size: height and width in pixels.
-        filter: "bilinear", "bicubic", or "area", OpenCV's INTER_AREA; where a side grows that is
-            INTER_LINEAR, as hloc has it.
+        filter: "bilinear", "bicubic", or "area": OpenCV's INTER_AREA or, if a side grows,
+            INTER_LINEAR, as in hloc.
         antialias: whether the filter widens where the image shrinks. Without it "bicubic" is a
-            little sharper, as torch's is.
-        pixels: "bytes" are rounded after each pass, as by Pillow; "floats" are neither rounded nor
+            little sharper, as in torch.
+        pixels: "bytes" are rounded after each pass, as in Pillow; "floats" are neither rounded nor
             clamped, and stay in the range of the image.
 
     Returns:
         The image at that size, of uint8 or float32.
 
     Raises:
-        InputError: the image is not 8-bit RGB, either size has no pixel, or no such filter.
+        InputError: the image is not 8-bit RGB, either size has no pixels, or an unknown filter.
 
     Example:
         >>> import numpy as np
@@ -106,9 +106,9 @@ _KERNELS: Mapping[str, tuple[int, Callable[[np.ndarray], np.ndarray]]] = {
     "bilinear": (1, _triangle),
     "bicubic": (2, functools.partial(_cubic, a=-0.5)),
 }
-"""Radius in output pixels and weights by distance, of Pillow's filters and torch's antialiased."""
+"""Radius in output pixels, and weights by distance, of Pillow's and torch's antialiased filters."""
 _SHARPER = {"bilinear": _triangle, "bicubic": functools.partial(_cubic, a=-0.75)}
-"""Weights of torch's filters without antialias."""
+"""Weights of torch's filters without antialiasing."""
 
 
 @functools.lru_cache(maxsize=256)
@@ -131,7 +131,7 @@ def _taps(old: int, new: int, name: str, antialias: bool) -> _Taps:
 
 
 def _taps_at_points(old: int, new: int, name: str) -> _Taps:
-    """Make taps that do not widen; beyond the border the last pixel is repeated."""
+    """Make taps without widening; beyond the border the last pixel is repeated."""
     support, _ = _KERNELS[name]
     points = (np.arange(new) + 0.5) * (old / new) - 0.5
     if name == "bilinear":
@@ -149,20 +149,20 @@ def _taps_at_points(old: int, new: int, name: str) -> _Taps:
 _COMPILING = threading.Lock()
 """Lock around the compilation: without it every thread would compile at its first image."""
 _FEW = 2**23
-"""Values that numpy resamples in about the time that numba takes to load: four photographs."""
+"""Number of values that numpy resamples in the time that numba takes to load: four photographs."""
 
 
 class _Seen:
-    """Counts the values that were resampled so far."""
+    """Counts the values resampled so far."""
 
     values = 0
 
 
 def _resampler(values: int, once: bool) -> Callable[..., None]:
-    """Return what resamples so many more values: numpy while they are few, or machine code.
+    """Return the function that resamples the next values: numpy for the first few, or numba.
 
-    Loading numba takes half a second, a third of the time from a start to a first answer
-    (docs/performance-studies.md). Without numba, numpy resamples all images.
+    Loading numba takes half a second, a third of the time from the start of a program to its first
+    answer (docs/performance-studies.md). Without numba, numpy resamples all images.
 
     Args:
         values: number of values of the image.
@@ -179,9 +179,9 @@ def _resampler(values: int, once: bool) -> Callable[..., None]:
 
 @functools.cache
 def _machine_code(once: bool) -> Callable[..., None] | None:
-    """Compile a loop, which then releases Python's global lock; None without numba.
+    """Compile a loop that releases the GIL; None without numba.
 
-    It compiles in about a second, and is cached in the `user_cache`, or where NUMBA_CACHE_DIR says.
+    Compiling takes about a second, and is cached in the `user_cache`, or in NUMBA_CACHE_DIR.
     """
     try:
         import numba
@@ -191,7 +191,7 @@ def _machine_code(once: bool) -> Callable[..., None] | None:
 
     function: Any = _resample if once else _resample_floats
     values = types.uint8 if once else types.float32
-    # A readonly array accepts writable ones too.
+    # A read-only type accepts writable arrays too.
     pixels = types.Array(values, 2, "C", readonly=True)
     taps = types.Tuple((types.int64[::1], types.int64[::1], types.float32[:, ::1]))
     rounds = () if once else (types.bool_,)
@@ -209,7 +209,7 @@ def _machine_code(once: bool) -> Callable[..., None] | None:
 
 
 def _resample(pixels: np.ndarray, rows: _Taps, columns: _Taps, resized: np.ndarray) -> None:
-    """Resample line after line, so that the rows between the two passes stay in the L1 cache."""
+    """Resample line by line, so that the rows between the two passes stay in the L1 cache."""
     first_line, line_count, line_weights = rows
     first_column, column_count, column_weights = columns
     line = np.empty(pixels.shape[1], np.float32)
@@ -237,7 +237,7 @@ def _resample(pixels: np.ndarray, rows: _Taps, columns: _Taps, resized: np.ndarr
 def _resample_floats(
     pixels: np.ndarray, rows: _Taps, columns: _Taps, resized: np.ndarray, rounds: bool
 ) -> None:
-    """Resample along rows, then along columns, as Pillow does; with `rounds` to 0 to 255."""
+    """Resample along rows, then columns, as Pillow does; `rounds` rounds and clips to 0 to 255."""
     first_line, line_count, line_weights = rows
     first_column, column_count, column_weights = columns
     lines = np.empty((pixels.shape[0], resized.shape[1]), np.float32)
@@ -270,7 +270,7 @@ def _resample_floats(
 
 
 def _step(pixels: np.ndarray, line_taps: _Taps, column_taps: _Taps, resized: np.ndarray) -> None:
-    """Resample as `_resample` does, to the bit, by numpy."""
+    """Resample with numpy, bit-identical to `_resample`."""
     near = _sums(pixels, line_taps).reshape(len(resized), -1, 3).swapaxes(0, 1)
     resized[:] = _sums(near, column_taps, 0.5).swapaxes(0, 1).reshape(resized.shape)
 
@@ -278,7 +278,7 @@ def _step(pixels: np.ndarray, line_taps: _Taps, column_taps: _Taps, resized: np.
 def _step_floats(
     pixels: np.ndarray, line_taps: _Taps, column_taps: _Taps, resized: np.ndarray, rounds: bool
 ) -> None:
-    """Resample as `_resample_floats` does, to the bit, by numpy."""
+    """Resample with numpy, bit-identical to `_resample_floats`."""
 
     def rounded(values: np.ndarray) -> np.ndarray:
         return np.clip(np.floor(values + np.float32(0.5)), 0, 255) if rounds else values
@@ -289,10 +289,10 @@ def _step_floats(
 
 
 def _sums(values: np.ndarray, taps: _Taps, start: float = 0.0) -> np.ndarray:
-    """Sum the weighted rows of each tap, a tap at a time; those beyond the last weigh nothing.
+    """Sum the weighted rows of each tap, a tap at a time; rows beyond the last have weight 0.
 
     A product of two float32 is exact in float64, so that each sum is rounded once, to float32, as
-    by a processor's fused instruction.
+    by a processor's fused multiply-add.
     """
     first, _, weights = taps
     sums = np.full((len(first), *values.shape[1:]), start, np.float32)

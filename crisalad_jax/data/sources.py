@@ -53,29 +53,29 @@ _FORMS = (
     "(.txt) or a table (.csv)"
 )
 _ROUNDING = 1e-3
-"""Metres by which two positions that are rounded may be nearer than they say."""
+"""Metres by which rounding may bring two positions closer together."""
 _PATTERN = re.compile(r"[*?\[]")
 
 
 @brief
 class ImageSource(NamedTuple):
-    """Images in order, and the names that descriptors and maps know them by."""
+    """Images in order, and their names in descriptor files and maps."""
 
     root: pathlib.Path
     """Folder that names are relative to."""
     paths: list[pathlib.Path]
-    """Below the root; frames of videos and logs under the names of `data.frames`."""
+    """Below the root; frames of videos and logs are named as in `data.frames`."""
     names: list[str]
     """Posix paths relative to the root, each once."""
     positions: Positions | None = None
-    """What the columns of a table say, or a topic of a robot log; None without these."""
+    """From the columns of a table or a topic of a robot log; None without these."""
 
     def located(self, given: Positions | Track | str | os.PathLike[str] | None = None) -> Positions:
-        """Return where the images were taken, as far as that is known.
+        """Return where the images were taken, as far as known.
 
         Args:
-            given: as of `positions_of`; None is what the source says, if it is a table, else what
-                @UTM names say, else the EXIF data of JPEGs.
+            given: see `positions_of`; None takes those of the source if it is a table, else those
+                in @UTM names, else the EXIF data of JPEGs.
 
         Raises:
             InputError: what `positions_of` raises.
@@ -88,14 +88,14 @@ class ImageSource(NamedTuple):
         return found if found.of else exif_positions(pictures)
 
     def spaced(self, positions: Positions, metres: float) -> Self:
-        """Leave out images that are nearer than so many metres to the last one of their sequence.
+        """Leave out images that are closer than `metres` to the last one of their sequence.
 
         A sequence is the images of a folder, or of a video, in order. Images without a position
         stay.
 
         Args:
             positions: where the images were taken.
-            metres: the least distance between two images.
+            metres: the smallest distance between two images.
 
         Raises:
             InputError: not a distance, or no image has a position.
@@ -137,24 +137,24 @@ def open_source(
 
     Args:
         images: a folder, searched with its subfolders; an image; a video; a robot log (`open_log`);
-            a pattern, where ** is any folders; a list, .txt, of a path a line; or a table, .csv,
-            with a column `name` (see `read_image_table`). Paths in lists and tables are relative to
-            their folder.
-        fps: frames a second taken of videos and logs; None is one, and a note says so.
-        topic: the topic of images in logs; None is the only one.
-        position_topic: the topic of positions in logs; None is the only one of NavSatFix, else the
-            only one of odometry or poses; "none" takes none.
-        on_bad_image: "skip" lists a missing file like the others, and whoever reads it leaves it
-            out; "stop" refuses it.
+            a pattern, where ** matches any folders; a list (.txt) with one path per line; or a
+            table (.csv) with a column `name` (see `read_image_table`). Paths in lists and tables
+            are relative to their folder.
+        fps: frames per second to take from videos and logs; None takes one, and a note says so.
+        topic: the topic of images in logs; None takes the only one.
+        position_topic: the topic of positions in logs; None takes the only one of NavSatFix, else
+            the only one of odometry or poses; "none" takes none.
+        on_bad_image: "skip" lists a missing file like the others, to be left out when it is read;
+            "stop" refuses it.
 
     Returns:
         The images. Names are relative to the folder; to that of the file; to the part of a pattern
-        before its first wildcard; to the folder of a list or table or, where a path leads out of
-        it, to the root of the file system.
+        before its first wildcard; to the folder of a list or table or, if a path leads out of it,
+        to the root of the file system.
 
     Raises:
-        InputError: no such source, no image in it, a path twice, or a file that is missing or that
-            no line of text can name.
+        InputError: no such source, no image in it, a repeated path, or a file that is missing or
+            whose name does not fit in one line of text.
     """
     if not os.fspath(images):
         raise InputError(f"images: found an empty name, expected {_FORMS}")
@@ -178,12 +178,12 @@ def open_source(
     root, found = file_of(path).parent, [path]
     if _PATTERN.search(str(path)) and not path.exists() and parse_frame(path) is None:
         root, found = _matching(path)
-    skips: OnBadImage = on_bad_image if suffix else "stop"  # a folder is no image to be skipped
+    skips: OnBadImage = on_bad_image if suffix else "stop"  # a folder is not an image to skip
     return _taken(root, frames, found, skips)
 
 
 def _remote(path: pathlib.Path) -> ImageSource:
-    """List the images at an address: one, a folder's or a pattern's.
+    """List the images at an address: a single one, or those of a folder or a pattern.
 
     Raises:
         InputError: there are none.
@@ -203,10 +203,10 @@ def open_sources(
     position_topic: str | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> list[ImageSource]:
-    """List the images of one source or of several, as `open_source` does each.
+    """List the images of one or several sources, each as `open_source` does.
 
     Raises:
-        InputError: no source; what `check_frames` raises, or `open_source`.
+        InputError: no source; or what `check_frames` or `open_source` raises.
     """
     given = [images] if isinstance(images, str | os.PathLike) else list(images)
     if not given:
@@ -221,14 +221,14 @@ def join_sources(sources: Sequence[ImageSource]) -> ImageSource:
     """Join the images of several sources.
 
     Args:
-        sources: of `open_sources`.
+        sources: from `open_sources`.
 
     Returns:
-        The images; of several sources each once, by the names that they have in a common folder.
-        They have positions if all that the sources have are in the same axes and zone.
+        The images. Those of several sources appear once each, named relative to a common folder.
+        They have positions if all positions of the sources are in the same axes and zone.
 
     Raises:
-        InputError: several sources, of which one is at an address.
+        InputError: several sources, one of them at an address.
     """
     if len(sources) == 1:
         return sources[0]
@@ -250,7 +250,7 @@ def join_sources(sources: Sequence[ImageSource]) -> ImageSource:
 
 
 class _Frames(NamedTuple):
-    """Which frames of videos and logs are taken."""
+    """Options for the frames to take from videos and logs."""
 
     given: pathlib.Path
     """What the user named, for messages."""
@@ -261,12 +261,12 @@ class _Frames(NamedTuple):
     def of(
         self, found: Sequence[pathlib.Path], expected: str, on_bad_image: OnBadImage
     ) -> tuple[list[pathlib.Path], Positions | None]:
-        """Put the frames of a video or log in its place, and name single frames by their own times.
+        """Replace videos and logs by their frames, and name single frames by their own times.
 
-        What is missing stays as it is under "skip", to be skipped by who reads it.
+        Under "skip", missing files stay in the list, to be skipped when they are read.
 
         Returns:
-            The images, and the positions of those that a log has them of, by path.
+            The images, and by path the positions that logs have of them.
         """
         paths: list[pathlib.Path] = []
         positions: Positions | None = None
@@ -302,7 +302,7 @@ class _Frames(NamedTuple):
 def _joined(
     positions: Positions | None, more: Positions | None, path: pathlib.Path
 ) -> Positions | None:
-    """Add the positions of a log to those of the logs before it."""
+    """Add the positions of a log to those of earlier logs."""
     if positions is None or more is None:
         return positions or more
     if positions.axes != more.axes:
@@ -320,16 +320,16 @@ def check_frames(
     topic: str | None = None,
     position_topic: str | None = None,
 ) -> None:
-    """Check that what chooses frames is given only where some image is such a frame.
+    """Check that options for choosing frames are given only if some image is such a frame.
 
     Args:
         paths: the images of all sources.
-        fps: the rate; None where none is given.
-        topic: the topic of images in a log; None where none is given.
-        position_topic: the same of positions.
+        fps: the rate; None if not given.
+        topic: the topic of images in a log; None if not given.
+        position_topic: the topic of positions in a log; None if not given.
 
     Raises:
-        InputError: it is of no use.
+        InputError: an option has no effect.
     """
     if (fps, topic, position_topic) == (None, None, None):
         return
@@ -355,7 +355,7 @@ def _source(
     positions: Positions | None = None,
     keys: Iterable[str] = (),
 ) -> ImageSource:
-    """Name the images; the positions of some are by their `keys`."""
+    """Name the images; `positions` refers to them by `keys`."""
     names = names_in(root, paths)
     twice = [name for name, count in collections.Counter(names).items() if count > 1]
     if twice:
@@ -390,14 +390,14 @@ def _listed(
     frames: _Frames,
     on_bad_image: OnBadImage,
 ) -> ImageSource:
-    """List the images that a text or table names, with the positions by the source's own names."""
+    """List the images that a list or table names; positions are by the names in that file."""
     if any(map(is_remote, names)):
         root, paths = _addresses(source, names)
         return _source(root, paths, source, positions, names)
     folder, disk = source.parent, Disk()
     found: list[pathlib.Path] = []
     for name in names:
-        # Written out, so that a name has no .. in it, and a path that is there twice is found.
+        # Normalised, so that names contain no .., and repeated paths are found.
         text = os.path.normpath(name)
         file = os.fspath(file_of(text))
         path = disk.find(folder, file) or folder / file
@@ -427,7 +427,7 @@ def _addresses(
     """Return the paths of addresses in a list or table, and their host or bucket.
 
     Raises:
-        InputError: some are not images at addresses, or not of one host or bucket.
+        InputError: some are not images at addresses, or not all are of one host or bucket.
     """
     paths = list(map(pathlib.Path, names))
     for path in paths:

@@ -1,6 +1,6 @@
 """Read CSV tables, and match the names of images in tables and lists with files.
 
-Windows writes backslashes between folders, and macOS accents as letters of their own (NFD).
+Windows writes backslashes between folders, and macOS writes accents as separate characters (NFD).
 """
 
 import collections
@@ -19,13 +19,13 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
 AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
-"""Names of a position's two numbers: metres of UTM, degrees, or metres of a frame of one's own."""
+"""Names of a position's two coordinates: UTM metres, degrees, or metres in a custom frame."""
 MOST_METRES = 1e8
 """Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
 _LINE = 2**20
-"""Letters after which a line is cut: its rest then has too many fields, or too few."""
+"""Characters after which a line is cut: the rest then has too many or too few fields."""
 _MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
-"""Largest number of a column of positions."""
+"""Largest value in a column of positions."""
 _SPELLINGS = {
     "name": ("filename", "file", "image", "path"),
     "lat": ("latitude",),
@@ -34,11 +34,11 @@ _SPELLINGS = {
     "north": ("northing", "utm_north"),
     "time": ("timestamp", "t", "date"),
 }
-"""What tables of images and tracks call their columns too; of several the first one counts."""
+"""Other names for the columns of tables of images and tracks; of several, the first one counts."""
 
 
 def number_of(text: str) -> float:
-    """Return the decimal number that a text is, NaN where it is none; `float` reads 1_0 as 10."""
+    """Convert a text to a decimal number, or NaN if it is not one; `float` reads 1_0 as 10."""
     plain = re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", text, re.ASCII | re.IGNORECASE)
     return float(text) if plain else math.nan
 
@@ -54,24 +54,24 @@ class Row(NamedTuple):
 
     @property
     def where(self) -> str:
-        """What a message about the row begins with: the file and the line."""
+        """Prefix of messages about the row: the file and the line."""
         return f"{self.path}: line {self.line}"
 
     def text(self, column: str) -> str:
-        """Return a field that may not be empty.
+        """Return a field that must not be empty.
 
         Raises:
-            InputError: it is.
+            InputError: it is empty.
         """
         if not self.fields[column]:
             raise InputError(f"{self.where}: found no {column}, expected one")
         return self.fields[column]
 
     def number(self, column: str) -> float:
-        """Return a finite number; next to a point, commas mean thousands.
+        """Return a finite number; with a point in it, commas mean thousands, and are refused.
 
         Raises:
-            InputError: the field is not one, or larger than such a position can be.
+            InputError: the field is not a number, or is larger than a position can be.
         """
         text, most = self.fields[column], _MOST.get(column, math.inf)
         value = number_of(text.replace(",", ".") if self.has_commas and "." not in text else text)
@@ -88,20 +88,20 @@ class Table(NamedTuple):
     columns: list[str]
     """The first row, without spaces around its fields."""
     lines: Iterator[tuple[int, list[str]]]
-    """Number and fields of every further row, as many as there are columns; they are read once."""
+    """Line number and fields of each further row, a field per column; can be iterated once."""
     has_commas: bool
 
     def axes(self, of: str, *, must: bool) -> tuple[str, str] | None:
-        """Return the columns of positions; None where no column is of any.
+        """Return the columns of positions; None if there are none.
 
         Args:
-            of: the column that they are given by, for the message.
-            must: whether there have to be positions.
+            of: the column that identifies the rows, for the message.
+            must: whether positions are required.
 
         Raises:
-            InputError: both pairs other than x,y, half a pair, or none where there must be one.
+            InputError: both pairs other than x,y; half a pair; or no pair although it is required.
         """
-        # x and y may be of anything, such as pixels, and count only where nothing else is there.
+        # x and y may be anything, such as pixels, and count only if there is no other pair.
         begun = [axes for axes in AXES[:2] if set(axes) & set(self.columns)]
         axes = (begun or [AXES[2]])[0]
         if len(begun) < 2 and set(axes) <= set(self.columns):
@@ -121,10 +121,10 @@ class Table(NamedTuple):
             yield Row(self.path, line, by_column, self.has_commas)
 
     def named_rows(self) -> Iterator[tuple[str, Row]]:
-        """Yield the image's name and the row; a frame of a video is written as in `data.frames`.
+        """Yield each image's name and row; video frames are named as in `data.frames`.
 
         Raises:
-            InputError: a row has no name, or one that an earlier row has, however it is spelled.
+            InputError: a row has no name, or the name of an earlier row, however it is spelled.
         """
         lines: dict[str, int] = {}
         for row in self.rows():
@@ -139,18 +139,18 @@ class Table(NamedTuple):
 def read_table(path: pathlib.Path, *needed: str, any_spelling: bool = False) -> Table:
     """Read a table whose first row has the names of the columns.
 
-    The separator is a comma or, where the header has more of them, a semicolon. A spreadsheet's
-    byte order mark is dropped.
+    The separator is a comma or, if the header has more of them, a semicolon. A spreadsheet's byte
+    order mark is dropped.
 
     Args:
         path: the file.
-        *needed: columns that it must have; without any, the first row may be one like the others.
+        *needed: required columns; without any, the first row may be data like the others.
         any_spelling: whether columns may be in capitals, or have other usual names such as
-            latitude; the table's are then name, lat, lon, east, north and time.
+            latitude; they are then renamed to name, lat, lon, east, north and time.
 
     Raises:
-        InputError: the file cannot be read, lacks a column or has one twice, or a row has other
-            than as many fields as the header.
+        InputError: the file cannot be read, lacks a column or has one twice, or the number of
+            fields in a row differs from the header's.
     """
     if not is_remote(path):
         check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
@@ -168,7 +168,7 @@ def read_table(path: pathlib.Path, *needed: str, any_spelling: bool = False) -> 
 
 
 def _plain(columns: Sequence[str]) -> list[str]:
-    """Return small letters, and this package's names of the columns of `_SPELLINGS`."""
+    """Return columns in lower case, with this package's names for those in `_SPELLINGS`."""
     plain = [column.lower() for column in columns]
     for own, others in _SPELLINGS.items():
         found = next((each for each in (own, *others) if each in plain), own)
@@ -199,7 +199,7 @@ def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
 
 
 def normal_name(name: str) -> str:
-    r"""Return a name with slashes, in normal form C.
+    r"""Return a name with forward slashes, in Unicode normal form C.
 
     Example:
         >>> normal_name("caf" + "e\u0301" + "\\" + "1.jpg")
@@ -214,9 +214,9 @@ def spellings(names: Collection[str]) -> dict[str, str]:
 
 
 def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
-    """Map each name to the existing name that it means; a name that means none is left out.
+    """Map each name to the existing name that matches it; names without a match are left out.
 
-    That is the name itself, or else one that differs only in slashes or its normal form.
+    The match is the name itself, or else one that differs only in slashes or normal form.
     """
     existing = spellings(there)
     found = {name: existing.get(name, existing.get(normal_name(name))) for name in names}
@@ -224,10 +224,10 @@ def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
 
 
 class Disk:
-    """Finds files by names; each folder is listed once, as to stat each file is slow far away."""
+    """Finds files by name, listing each folder once: a stat per file is slow on remote disks."""
 
     def __init__(self, root: pathlib.Path | None = None) -> None:
-        """Begin without any listing; or with all below a root, which is an address.
+        """Start without listings, or with those of all folders below a remote root.
 
         Raises:
             InputError: the address cannot be listed.
@@ -242,7 +242,7 @@ class Disk:
             self._listings = {folder: spellings(names) for folder, names in inside.items()}
 
     def find(self, root: pathlib.Path, name: str) -> pathlib.Path | None:
-        """Return the path below `root` that a name means; None where there is none."""
+        """Return the path below `root` that matches a name; None if there is none."""
         path = root / name
         if (there := self.names(path.parent).get(path.name)) is not None:
             return path.with_name(there)
@@ -255,7 +255,7 @@ class Disk:
         return path
 
     def names(self, folder: pathlib.Path) -> dict[str, str]:
-        """Return the names in a folder, by themselves and by their `normal_name`."""
+        """Map the names in a folder, and their `normal_name`s, to the names themselves."""
         if folder not in self._listings:
             names = () if self._is_whole else list_names(folder)
             self._listings[folder] = spellings(names)

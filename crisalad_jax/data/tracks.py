@@ -1,7 +1,7 @@
-"""Read tracks, positions along time: GPX 1.1 (Topografix), GeoJSON (RFC 7946) or a table.
+"""Read tracks (positions over time): GPX 1.1 (Topografix), GeoJSON (RFC 7946) or a table.
 
-RFC 7946 has no times. They are where togeojson writes them: `coordTimes`, also `times`, of a line,
-and `time` of a point.
+RFC 7946 has no times. They are read where togeojson writes them: `coordTimes`, also `times`, of a
+line, and `time` of a point.
 """
 
 import contextlib
@@ -29,31 +29,31 @@ _Point = tuple[object, Any, Any]
 
 @brief
 class Track(NamedTuple):
-    """Where something was, along time."""
+    """Positions over time."""
 
     source: str
     """The file, for messages."""
     axes: tuple[str, str]
-    """Names of a position's two numbers, as of `Positions`."""
+    """Names of the two coordinates, as in `Positions`."""
     times: Float64[np.ndarray, " point"]
     """Seconds since 1970, ascending."""
     points: Float64[np.ndarray, "point 2"]
     start_time: float | None = None
-    """When a video of the images began, in seconds since 1970; None where that is unknown."""
+    """When a video of the images began, in seconds since 1970; None if unknown."""
     time_offset: float = 0.0
     """Seconds that are added to the times of images."""
 
     def interpolate(
         self, times: Float64[np.ndarray, " image"]
     ) -> tuple[Float64[np.ndarray, "image 2"], Float64[np.ndarray, " image"]]:
-        """Compute positions between the track's points, linearly in time.
+        """Interpolate positions linearly in time between the track's points.
 
         Args:
             times: in seconds since 1970.
 
         Returns:
-            The positions, NaN before the first point and after the last one; and the seconds
-            between the two points that each lies between, 0 where it is at a point.
+            The positions, NaN before the first point and after the last one; and for each the
+            seconds between the two track points around it, 0 where it is at a point.
 
         Example:
             >>> import numpy as np
@@ -77,7 +77,7 @@ class Track(NamedTuple):
 
 
 def is_track(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file of positions has them by time, and not by the names of images.
+    """Return whether a file lists positions by time rather than by the names of images.
 
     Raises:
         InputError: a table that cannot be read.
@@ -94,11 +94,11 @@ def read_track(
 ) -> Track:
     """Read a track: GPX, GeoJSON, or a table with a column `time` and positions.
 
-    Times are ISO 8601, of UTC where they have no zone, or in tables also numbers since 1970: of
-    seconds, milli-, micro- or nanoseconds, as their size says.
+    Times are ISO 8601, in UTC if they have no zone, or in tables also numbers since 1970: seconds,
+    milli-, micro- or nanoseconds, depending on their size.
 
     Args:
-        path: the file. .gpx has points of tracks with times. .geojson or .json has lines with
+        path: the file. A .gpx has track points with times. A .geojson or .json has lines with
             `coordTimes` or `times`, or points with `time`. A table has the columns time and
             lat,lon or east,north or x,y, or other usual names of these.
         start_time: when a video of the images began, with the zone: "2026-05-01T12:00:00+02:00".
@@ -146,7 +146,7 @@ def read_track(
 
 
 def utc(seconds: Any) -> str:
-    """Write a time since 1970 for a message.
+    """Format the seconds since 1970 for a message.
 
     Example:
         >>> utc(1777629600.25)
@@ -156,7 +156,7 @@ def utc(seconds: Any) -> str:
 
 
 def time_of(text: str) -> float:
-    """Return the seconds since 1970 of ISO 8601, of UTC where it has no zone.
+    """Convert ISO 8601 to seconds since 1970, as UTC if it has no zone.
 
     Raises:
         ValueError: it is not a time.
@@ -176,10 +176,10 @@ def _start_of(text: str) -> float:
 
 
 def _time_in(path: pathlib.Path, time: object) -> float:
-    """Return the seconds since 1970 of ISO 8601 or a number."""
+    """Convert ISO 8601 or a number to seconds since 1970."""
     number = number_of(str(time))
     if abs(number) < 1e20:
-        # Nanoseconds of these years are 1e18, and seconds 1e9.
+        # In these years, nanoseconds are about 1e18 and seconds about 1e9.
         return number / 1000 ** sum(number >= most for most in (1e11, 1e14, 1e17))
     try:
         return time_of(str(time))
@@ -207,10 +207,10 @@ def _as_degrees(
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Builds trees of XML without entities of its own, which can fill any memory."""
+    """Builds XML trees without custom entities, which can expand to fill any memory."""
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        """Refuse a document type, which GPX has none of."""
+        """Refuse a document type, which GPX does not have."""
         raise ValueError("a document type (DOCTYPE)")
 
 
@@ -226,7 +226,7 @@ def _gpx_points(path: pathlib.Path) -> Iterator[_Point]:
 
 
 def _geojson_points(path: pathlib.Path) -> list[_Point]:
-    """Return the points of lines and the points with times; others are left out where some are."""
+    """Return the points of lines and of point features; if any have times, only those that do."""
     expected = "GeoJSON of lines with coordTimes, or of points with time"
     value = parse_json(read_text(path, expected), str(path), expected)
     found: list[_Point] = []

@@ -1,6 +1,6 @@
-"""Frames of video files, under the names of `data.frames`: `walk.mp4#t=12.500`.
+"""Frames of video files, named as in `data.frames`: `walk.mp4#t=12.500`.
 
-Times are those in the file, so that a rate that varies does no harm. Every verb names a frame by
+Times are those in the file, so a variable frame rate does no harm. Every command names a frame by
 its own time in whole milliseconds, however a user wrote it: `frame_name` writes the name,
 `milliseconds_of` reads the time, `name_frame` finds the frame.
 """
@@ -19,7 +19,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.shapes import UInt8
 
-# Our errors say what the user needs. OpenCV reads this as it opens its first video.
+# Our errors say what the user needs to know. OpenCV reads this when it opens its first video.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
@@ -27,30 +27,30 @@ _VIDEO = f"a video ({' '.join(VIDEO_SUFFIXES)})"
 _OPEN = 2
 """Number of videos that stay open between frames."""
 _FAR = 30_000
-"""Milliseconds ahead from which seeking beats decoding all that is between."""
+"""Milliseconds ahead from which seeking is faster than decoding everything in between."""
 _BEFORE_KEY = 2_000
-"""Milliseconds before a wanted frame that are sought: some decoders arrive late."""
+"""Milliseconds before a wanted frame to seek to: some decoders land too late."""
 
 
 def milliseconds_of(capture: cv2.VideoCapture) -> int:
-    """Read the time of the frame that a video is at."""
+    """Read the time of a video's current frame."""
     return round(capture.get(cv2.CAP_PROP_POS_MSEC))
 
 
 def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib.Path]:
-    """List the frames of a video that are nearest after each 1 / fps seconds.
+    """List the first frame of a video at or after each multiple of 1 / fps seconds.
 
     The times are read from the container. Nothing is decoded.
 
     Args:
         video: the file.
-        fps: frames for each second, as `check_rate` takes it; more than the video has are all.
+        fps: frames per second (see `check_rate`); a rate above the video's lists all.
 
     Returns:
         Names of frames, which `read_image` reads.
 
     Raises:
-        InputError: no file, or no video.
+        InputError: the file is missing, or is not a video.
     """
     times = _video(video).times
     return [pathlib.Path(frame_name(video, times[index])) for index in sampled(times, fps)]
@@ -60,19 +60,19 @@ def count_frames(video: str | os.PathLike[str]) -> int:
     """Count all frames of a video.
 
     Raises:
-        InputError: no file, or no video.
+        InputError: the file is missing, or is not a video.
     """
     return len(_video(video).times)
 
 
 def name_frame(frame: FrameName) -> pathlib.Path:
-    """Name a frame by its own time: of a time between two, the frame that `read_frame` reads.
+    """Name a frame by its own time; between two frames, name the one that `read_frame` reads.
 
     Args:
-        frame: of a video.
+        frame: a frame of a video.
 
     Returns:
-        The name. A time behind the video's last frame stays, for the reader to tell.
+        The name. A time after the video's last frame stays, for the reader to report.
 
     Raises:
         InputError: the video is missing or does not decode.
@@ -83,7 +83,7 @@ def name_frame(frame: FrameName) -> pathlib.Path:
 
 
 class _Video:
-    """A video, which is read forwards as far as possible."""
+    """A video, which is read forwards where possible."""
 
     def __init__(self, file: str) -> None:
         self._file = file
@@ -95,7 +95,7 @@ class _Video:
     def times(self) -> list[int]:
         """Times of all frames in milliseconds, in order, each once."""
         times = self._grabbed_times(decoded=False)
-        # A video that was trimmed without encoding it again keeps frames that are not shown.
+        # A video trimmed without re-encoding still contains frames that are not shown.
         if not times or _Video(self._file).read(times[-1]) is None:
             times = self._grabbed_times(decoded=True)
         if not times:
@@ -104,7 +104,7 @@ class _Video:
 
     def _grabbed_times(self, *, decoded: bool) -> list[int]:
         capture = _opened(self._file)
-        if not decoded:  # packets as they are, in the order of decoding
+        if not decoded:  # raw packets, in decoding order
             capture.set(cv2.CAP_PROP_FORMAT, -1)
         times = set()
         while capture.grab():
@@ -112,7 +112,7 @@ class _Video:
         return sorted(time for time in times if time >= 0)
 
     def read(self, wanted: int) -> UInt8[np.ndarray, "h w 3"] | None:
-        """Read the first frame at or after a time; None behind the last one."""
+        """Read the first frame at or after a time; None after the last one."""
         if not self._at <= wanted < self._at + _FAR:
             self._seek(wanted)
         while self._at < wanted:
@@ -138,11 +138,11 @@ def _opened(video: str) -> cv2.VideoCapture:
 
 
 _lock = threading.Lock()
-"""Lock of all videos: OpenCV's may not be used by two threads at once."""
+"""Lock for all videos: two threads must not use OpenCV's at once."""
 
 
 def _video(path: str | os.PathLike[str]) -> _Video:
-    """Return a video as it is now; the last ones stay open."""
+    """Open a video in its current state; the last ones stay open."""
     check_source(path, _VIDEO)
     there = os.stat(path)
     return _as_of(os.path.abspath(path), there.st_size, there.st_mtime_ns)
@@ -150,7 +150,7 @@ def _video(path: str | os.PathLike[str]) -> _Video:
 
 @functools.lru_cache(maxsize=_OPEN)  # a list may name thousands of frames of a video
 def _as_of(file: str, size: int, changed: int) -> _Video:
-    """Open a file of this size and time of change."""
+    """Open a file; its size and time of change are part of the cache's key."""
     return _Video(file)
 
 
@@ -160,7 +160,7 @@ def read_frame(frame: FrameName) -> UInt8[np.ndarray, "h w 3"]:
     Frames are read in order of time without seeking, so one thread should read a video.
 
     Raises:
-        InputError: no video, or no such frame in it.
+        InputError: the file is not a video, or has no such frame.
     """
     video = _video(frame.file)
     with _lock:

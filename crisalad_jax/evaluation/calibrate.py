@@ -1,4 +1,4 @@
-"""Calibration of a map: from which similarity on its answers are right to a precision."""
+"""Calibration of a map: the similarity from which its answers reach a given precision."""
 
 import datetime
 import math
@@ -34,30 +34,28 @@ def calibrate(
     verify: Verify | None = None,
     reading: Reading = Reading(),
 ) -> Calibration:
-    """Measure from which similarity on answers are right, and let a map remember it.
+    """Measure the similarity from which answers reach a precision, and store it in the map.
 
-    The set is evaluated with the map's model, image size and components, every image alone, as
-    `query` does.
-    The map's own images are not looked at. So the set's database should be of the map's places or
-    of places like them, about as many, and its queries like those that the map will be asked. They
-    should show unknown places too, which count as wrong when answered.
+    The set is evaluated with the map's model, image size and components, each image independently,
+    as in `query`. The map's own images are not used. So the set's database should show the map's
+    places, or about as many similar ones, and its queries should be like those that the map will
+    get. Include queries of unknown places: they count as wrong when answered.
 
     Args:
-        places: the map, open. It remembers the result in its folder, in place of an earlier one.
-        benchmark: the set, such as `open_benchmark` makes.
-        precision: share of the answers that must be right, above 0 to 1.
-        model: the model that made the map; None loads it from where it was (`Map.load_model`).
-        verify: measures how many inliers verified answers must have, which the map remembers
-            apart; None measures the similarity.
+        places: the open map; the result is stored in its folder and replaces an earlier one.
+        benchmark: the set, for instance from `open_benchmark`.
+        precision: share of the answers that must be correct, above 0 and at most 1.
+        model: the model that made the map; None loads it from its recorded path (`Map.load_model`).
+        verify: measures how many inliers verified answers must have, which the map stores
+            separately; None measures the similarity.
         reading: how images are read.
 
     Returns:
-        What the map remembers from now on.
+        The calibration that the map now stores.
 
     Raises:
-        InputError: no similarity reaches the precision, or it rests on fewer answers than the
-            precision takes, and the map stays as it was; parameters of another model; or what
-            `evaluate` raises.
+        InputError: no similarity reaches the precision, or it rests on too few answers (the map is
+            then unchanged); parameters of another model; or what `evaluate` raises.
 
     Example:
         >>> import jax, shutil
@@ -92,7 +90,7 @@ def calibrate(
         reading=reading,
     )
     point = result.operating_point
-    assert point is not None  # asked for above
+    assert point is not None  # requested above
     if not point.reached:
         raise InputError(f"precision: {caveats(point)[0]}, on {benchmark.name}")
     check_supported(point, benchmark.name)
@@ -117,7 +115,7 @@ def calibrate(
 
 
 def operating_point_of(calibration: Calibration) -> OperatingPoint:
-    """Return the operating point that a map remembers."""
+    """Return a map's stored calibration as an operating point."""
     measured = {name: getattr(calibration, name) for name in _MEASURED}
     if calibration.verifier:
         measured["min_similarity"] = calibration.min_inliers

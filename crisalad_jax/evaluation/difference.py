@@ -1,4 +1,4 @@
-"""The difference of two recalls on the same queries, and how sure it is."""
+"""The difference of two recalls on the same queries, and its confidence interval."""
 
 from typing import Literal, NamedTuple
 
@@ -13,15 +13,15 @@ RESAMPLES = 10_000
 
 
 class Difference(NamedTuple):
-    """A method's recall less the reference's, as fractions of the same queries."""
+    """A method's recall minus the reference's, as fractions of the same queries."""
 
     mean: float
     """Difference of the means over the seeds."""
     interval: Interval
-    """95 % interval of it over queries and seeds."""
+    """95 % interval of the difference, over queries and seeds."""
 
     verdict: Literal["better", "worse", "not told apart"]
-    """What the interval decides: "better" or "worse" where it excludes 0."""
+    """What the interval shows: "better" or "worse" if it excludes 0."""
 
 
 def paired_difference(
@@ -32,27 +32,27 @@ def paired_difference(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Difference:
-    """Compute the difference of two recalls, and its percentile bootstrap's 95 % interval.
+    """Compute the difference of two recalls, and its 95 % interval by percentile bootstrap.
 
-    A resample draws as many queries with replacement, the same ones for both methods, and as many
-    seeds. Runs of one seed share initial values and batches, so that the same seeds are drawn for
-    both methods; what a seed does to both cancels. Queries with the same hits are drawn together,
-    by a multinomial distribution, which is exact and takes no more time for more queries.
+    A resample draws as many queries and seeds as there are, with replacement, the same queries for
+    both methods. Runs of one seed share initial values and batches, so the same seeds are drawn for
+    both, and what a seed does to both cancels. Queries with the same hits are drawn together from a
+    multinomial distribution, which is exact and takes no longer with more queries.
 
     Args:
         hits: whether each query was a hit, for each seed of the method.
-        reference: the same of the reference, on the same queries.
+        reference: the same for the reference, on the same queries.
         same_seeds: whether row i of both is a run of the same seed. If not, as for a model from a
             file, the seeds of each method are drawn independently.
         resamples: number of resamples.
-        seed: of the resampling; the same one gives the same interval.
+        seed: seed of the resampling; the same seed gives the same interval.
 
     Returns:
-        The difference, positive where the method recalls more.
+        The difference, positive if the method recalls more.
 
     Raises:
-        InputError: no queries or seeds, other queries than the reference's, or another number of
-            seeds although they are the same.
+        InputError: no queries or seeds, other queries than the reference's, or different numbers of
+            seeds with `same_seeds`.
 
     Example:
         >>> first, second = np.array([[True, True, True, False]]), np.array([[False] * 4])
@@ -74,7 +74,7 @@ def paired_difference(
     weights = _drawn_seeds(generator, resamples, len(hits))
     other = weights if same_seeds else _drawn_seeds(generator, resamples, len(reference))
     differences = (weights * ours).sum(axis=1) - (other * theirs).sum(axis=1)
-    # Sums that are equal in exact arithmetic must not differ by their rounding.
+    # Sums that are equal in exact arithmetic must not differ by rounding.
     low, high = np.quantile(differences.round(12), (0.025, 0.975))
     verdict = "better" if low > 0 else "worse" if high < 0 else "not told apart"
     mean = float(hits.mean() - reference.mean())

@@ -40,7 +40,7 @@ from crisalad_jax.utils.errors import InputError
 KS = (1, 5, 10, 20)
 
 Observe = Callable[[str, Descriptors, Descriptors], None]
-"""Takes the name of a grouping, the database's descriptors, and the queries' descriptors."""
+"""Takes the name of a grouping, the database descriptors, and the query descriptors."""
 
 
 @takes(benchmark=Benchmark)
@@ -60,40 +60,41 @@ def evaluate(
 ) -> list[GroupingResult]:
     r"""Measure Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
 
-    Two images of one side show the same place if the benchmark's positions say so. A benchmark
-    without positions uses its ground truth (`evaluation.leakage`).
+    Whether two images of one side show the same place is decided by the benchmark's positions, or
+    without positions by its ground truth (`evaluation.leakage`).
 
-    A model without a cross-image encoder has one grouping, `any`: no descriptor depends on a batch.
-    Memory holds the tokens of all images, and the descriptors of one grouping and seed at a time.
+    A model without a cross-image encoder has one grouping, `any`: its descriptors do not depend on
+    the batch. The tokens of all images are held in memory, and the descriptors of one grouping and
+    seed at a time.
 
     Args:
         model: parameters and configuration, as `load` returns them, or a `Runtime`.
         benchmark: what to evaluate on.
         groupings: each as `Grouping.parse` reads it, or `published:NAME` with cricavpr, crisalad or
-            sage: the batches of that paper's evaluation, then the honest ones of as many images.
-        seed: draws the first shuffle: the database's, and with the next seed the queries'.
-        seeds: shuffles, each from the second seed after the one before.
-        pca: shortens the descriptors, fitted to images of other places.
-        dtype: what descriptors are compared as; "bits" are their signs (`pack_bits`), compared by
-            the Hamming distance.
-        observe: is given the descriptors of each grouping, of its first seed; of bits, unit vectors
-            of the signs.
-        rerank: a second stage; each grouping has a result without and then one with it.
-        precision: asks each result for its `operating_point`: the similarity from which first
-            retrievals are correct with this precision, and the recall that is left.
+            sage: the batches of that paper's evaluation, then the honest ones of the same size.
+        seed: seed of the first shuffle of the database; the queries use the next seed.
+        seeds: number of shuffles, whose seeds are two apart.
+        pca: shortens the descriptors; fitted to images of other places.
+        dtype: how descriptors are compared; "bits" compares their signs (`pack_bits`) by the
+            Hamming distance.
+        observe: called with the descriptors of each grouping's first seed; for bits, with unit
+            vectors of the signs.
+        rerank: a second stage; each grouping then has a result without and one with it.
+        precision: adds an `operating_point` to each result: the similarity from which first
+            retrievals are correct with this precision, and the recall that remains.
         reading: how images are read; its batch size is the number of images that attend to each
-            other. Under "skip" the results are of the set without unreadable images
+            other. With "skip" the results are for the set without unreadable images
             (`GroupingResult.skipped`).
 
     Returns:
         A result for each grouping, and with `rerank` a second one.
 
     Raises:
-        InputError: parameters of another configuration, bits of a length that is not a multiple of
-            8, no ground truth, an image cannot be read
-            or none of a side, components that are not for this model or make no unit vectors, such
-            a precision, or what `Grouping.parse`, `Reranking.check` and `Reranking.stage` raise; a
-            published grouping whose batches are not known for this set.
+        InputError: parameters of another configuration; bits of a length that is not a multiple of
+            8; no ground truth; an image cannot be read, or none of a side can; components that are
+            not for this model or give no unit vectors; a precision out of range; a published
+            grouping whose batches are not known for this set; or what `Grouping.parse`,
+            `Reranking.check` and `Reranking.stage` raise.
 
     Example:
         >>> import jax, shutil
@@ -126,7 +127,7 @@ def evaluate(
                     "rerank: found another engine, expected weights of its own (--rerank-weights)"
                 )
             rerank = dataclasses.replace(rerank, model=model)
-    benchmark.ground_truth()  # or there is none, which is known before any work
+    benchmark.ground_truth()  # fails before any work if there is none
     reading = reading.fitted(max(len(benchmark.database), len(benchmark.queries)))
     database, queries = (
         TokenSet(describer, paths, reading, label)
@@ -190,7 +191,7 @@ class _Side(NamedTuple):
     tokens: TokenSet
     same: SamePlace
     offset: int
-    """Added to the seed of a shuffle, so that the two sides are never shuffled alike."""
+    """Added to the seed of a shuffle, so that the two sides never get the same one."""
     pca: Pca | None
 
     def batches(self, kind: str, batch_size: int | None, seed: int) -> Batches:
@@ -206,7 +207,7 @@ class _Side(NamedTuple):
 
 
 def same_place_rule(benchmark: Benchmark) -> str:
-    """Tell in words how `evaluate` decides that two images of a side show the same place."""
+    """Describe how `evaluate` decides that two images of a side show the same place."""
     if benchmark.query_positions is None or benchmark.database_positions is None:
         return "a common positive"
     return f"a distance of at most {benchmark.radius:g} m"
@@ -215,7 +216,7 @@ def same_place_rule(benchmark: Benchmark) -> str:
 def _same_place(
     benchmark: Benchmark, positives: Sequence[Int64[np.ndarray, " _"]]
 ) -> tuple[SamePlace, SamePlace]:
-    """Make both sides' tests of same-place images, by positions or else by ground truth."""
+    """Return the same-place tests of both sides, by positions or else by ground truth."""
     if benchmark.query_positions is None or benchmark.database_positions is None:
         return by_truth(positives, len(benchmark.database))
     radius = benchmark.radius
@@ -233,13 +234,13 @@ def _rank(
     unit: bool,
     bits: bool,
 ) -> tuple[dict[int, Neighbours], dict[str, float | None]]:
-    """Rank the k nearest neighbours for each seed; only shuffled sides are described anew.
+    """Rank the k nearest neighbours for each seed; only shuffled sides are described again.
 
-    `observe` is given the descriptors of the first seed. Those that are not unit vectors are ranked
-    by Euclidean distance, and bits by the Hamming distance.
+    `observe` gets the descriptors of the first seed. Descriptors that are not unit vectors are
+    ranked by Euclidean distance, and bits by Hamming distance.
 
     Returns:
-        The rankings by seed, and what leaks: fields of `GroupingResult`, the mean over the seeds.
+        The rankings by seed, and the leakage: fields of `GroupingResult`, averaged over the seeds.
     """
     kinds = grouping.database, grouping.queries
     descriptors: dict[int, Descriptors] = {}
@@ -250,7 +251,7 @@ def _rank(
     for seed in seeds:
         for number, (side, kind) in enumerate(zip(sides, kinds, strict=True)):
             if kind == "shuffled" or seed == seeds[0]:
-                descriptors.pop(number, None)  # makes room
+                descriptors.pop(number, None)  # frees memory
                 batches[number] = side.batches(kind, grouping.batch_size, seed)
                 shares[number] = same_place_share(batches[number], side.same)
                 described = side.describe(batches[number])

@@ -1,4 +1,4 @@
-"""Leakage of a grouping: what the images in sight of an image tell of its place."""
+"""Leakage of a grouping: how much the images of a batch reveal about each other's place."""
 
 from collections.abc import Callable, Sequence
 
@@ -11,14 +11,14 @@ from crisalad_jax.retrieval.grouping import MASKED, Batches
 SamePlace = Callable[
     [Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]], Bool[np.ndarray, " pair"]
 ]
-"""Tests pair by pair whether two images of one side, by number, show the same place."""
+"""Tests, for each pair of image indices of one side, whether both show the same place."""
 
-# Numbers in an array of pairs: tens of megabytes, whatever the number of images.
+# Elements in an array of pairs: tens of megabytes, for any number of images.
 _CHUNK = 2**21
 
 
 def near(positions: Float64[np.ndarray, "image axis"], radius: float) -> SamePlace:
-    """Make the test that two images were taken at most `radius` metres apart."""
+    """Return a test of whether two images were taken at most `radius` metres apart."""
 
     def same(a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]) -> np.ndarray:
         return np.square(positions[a] - positions[b]).sum(axis=1) <= radius * radius
@@ -29,18 +29,18 @@ def near(positions: Float64[np.ndarray, "image axis"], radius: float) -> SamePla
 def by_truth(
     positives: Sequence[Int64[np.ndarray, " _"]], database: int
 ) -> tuple[SamePlace, SamePlace]:
-    """Make the tests of the queries and of the `database` images from the ground truth alone.
+    """Return same-place tests for the queries and the `database` images, from ground truth only.
 
-    Two queries show the same place if some database image is right for both, and two database
-    images if both are right for some query. An image without any positive shares its place with
-    no other image, whatever it shows.
+    Two queries show the same place if some database image is correct for both, and two database
+    images if both are correct for some query. An image without positives shares its place with no
+    other image, whatever it shows.
     """
     truth = _truth(positives, database)
     return _sharing(truth), _sharing(truth.T.tocsr())
 
 
 def _truth(positives: Sequence[Int64[np.ndarray, " _"]], database: int) -> scipy.sparse.csr_array:
-    """Return which database images are right for each query, as a matrix of ones."""
+    """Return which database images are correct for each query, as a sparse matrix of ones."""
     right = np.concatenate(positives) if positives else np.empty(0, np.int64)
     asking = np.repeat(np.arange(len(positives)), [len(each) for each in positives])
     entries = np.ones(len(right), np.int32), (asking, right)
@@ -48,7 +48,7 @@ def _truth(positives: Sequence[Int64[np.ndarray, " _"]], database: int) -> scipy
 
 
 def _sharing(owned: scipy.sparse.csr_array) -> SamePlace:
-    """Make the test that two rows have an entry in common; memory is linear in pairs."""
+    """Return a test of whether two rows share an entry; memory is linear in the pairs."""
     step = max(1, _CHUNK // int(np.diff(owned.indptr).max(initial=1)))
 
     def same(a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]) -> np.ndarray:
@@ -60,13 +60,13 @@ def _sharing(owned: scipy.sparse.csr_array) -> SamePlace:
 
 
 def masked(batches: Batches, same: SamePlace) -> Batches:
-    """Give each image the others of its batch that show other places.
+    """Let each image attend only to those images of its batch that show other places.
 
-    Each image gets a batch of its own: masked in a batch of all, another image of its place would
-    arrive through a third one in the second layer.
+    Each image gets its own batch. In a shared batch with a mask, the second layer would still see
+    another image of its place through a third one.
 
     Args:
-        batches: batches in which every filled place is kept.
+        batches: batches in which every filled slot is kept.
         same: whether two images show the same place.
     """
     batch, place = np.nonzero(batches.kept)
@@ -82,13 +82,13 @@ def masked(batches: Batches, same: SamePlace) -> Batches:
 def mirrored_share(
     queries: Batches, database: Batches, positives: Sequence[Int64[np.ndarray, " _"]]
 ) -> float | None:
-    """Measure how far a query's batch is known again in the batch of its right answer, 0 to 1.
+    """Measure how closely a query's batch mirrors the batch of its correct answer, 0 to 1.
 
-    That is the share of the other images in a query's batch that have a positive in the batch of
-    the query's own positive; of several positives the largest share. Where files of both sides are
-    in the same order it is 1: two batches hold the same places, and what they have in common says
-    which stretch of the files this is. It is averaged over the queries with a positive that looked
-    at other images; None where none did, or no database image looked at another.
+    This is the share of the other images in a query's batch that have a positive in the batch of
+    the query's own positive; of several positives, the largest share counts. If the files of both
+    sides are in the same order it is 1: both batches hold the same places, and what they have in
+    common identifies the stretch of files. It is averaged over the queries with a positive that
+    attend to other images; None if there are none, or if no database image attends to another.
     """
     if "single" in (queries.grouping, database.grouping):
         return None
@@ -114,9 +114,9 @@ def _sight(batches: Batches) -> scipy.sparse.csr_array:
 
 
 def same_place_share(batches: Batches, same: SamePlace) -> float | None:
-    """Measure which share of the other images in a batch show an image's own place, 0 to 1.
+    """Measure the share of the other images in a batch that show an image's own place, 0 to 1.
 
-    The share is averaged over all images that looked at another one; None where none did.
+    The share is averaged over all images that attend to another one; None if none does.
     """
     if batches.grouping == "single":
         return None

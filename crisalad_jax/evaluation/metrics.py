@@ -1,6 +1,6 @@
 """Recall@K with confidence intervals, and precision-recall.
 
-The protocol is the public one of visual place recognition: a recall counts every query.
+This is the public protocol of visual place recognition: a recall counts every query.
 """
 
 from collections.abc import Sequence
@@ -17,15 +17,15 @@ from crisalad_jax.utils.errors import InputError
 def right_retrievals(
     indices: Int[np.ndarray, "q k"], positives: Sequence[Int[np.ndarray, " _"]]
 ) -> Bool[np.ndarray, "q k"]:
-    """Mark the retrieved database images that are right for their query.
+    """Mark the retrieved database images that are correct for their query.
 
     Args:
         indices: database indices of each query's neighbours, best first.
-        positives: the database indices that are right for each query, possibly none.
+        positives: the database indices that are correct for each query, possibly none.
 
     Raises:
-        InputError: no queries; positives for another number of queries; a negative positive, which
-            some ground truths write for "no match" (leave it out).
+        InputError: no queries; positives for a different number of queries; a negative index, which
+            some ground truths use for "no match" (leave it out).
     """
     fits = 0 < len(indices) == len(positives)
     if not fits or any(np.min(wanted, initial=0) < 0 for wanted in positives):
@@ -44,12 +44,12 @@ def recalls(
 ) -> dict[int, float]:
     """Compute Recall@K: the share of **all** queries with a positive among their top K.
 
-    A query without positives is a miss. A K beyond the columns counts all of them: `search` for
-    max(ks) returns fewer only where the database is smaller.
+    A query without positives is a miss. If K exceeds the number of columns, all of them count:
+    `search` with max(ks) returns fewer only if the database is smaller.
 
     Args:
         indices: database indices of each query's neighbours, best first.
-        positives: the database indices that are right for each query, possibly none.
+        positives: the database indices that are correct for each query, possibly none.
         ks: the values of K.
 
     Returns:
@@ -74,18 +74,18 @@ class Interval(NamedTuple):
 def bootstrap_interval(hits: Int[np.ndarray, " q"], trials: int = 1) -> Interval:
     """Compute the percentile bootstrap's 95 % interval (Efron 1979) of the mean of hits / trials.
 
-    For whole numbers the limit of infinitely many resamples is known exactly, without drawing any.
-    A resample sums q independent draws from the queries' hits. That sum is distributed as the
-    q-fold convolution of the hits' frequencies, computed by a Fourier transform; for one trial it
-    is the binomial distribution.
+    Hits are integers, so the limit of infinitely many resamples is computed exactly, without
+    drawing any. A resample sums q independent draws from the queries' hits. That sum is distributed
+    as the q-fold convolution of the hit frequencies, computed by a Fourier transform; for one trial
+    it is the binomial distribution.
 
-    The queries are assumed to be independent. Frames of one camera are not, so that their interval
-    is too narrow. An interval of width 0, at 0 or 1, says that all of these queries agree, not that
+    The queries are assumed to be independent. Frames of one camera are not, so their interval is
+    too narrow. An interval of width 0, at 0 or 1, means that all of these queries agree, not that
     other queries would.
 
     Args:
-        hits: in how many of the trials each query was a hit.
-        trials: for instance the seeds of a shuffle; the interval does not hold their spread.
+        hits: number of trials in which each query was a hit.
+        trials: for instance the seeds of a shuffle; the interval does not include their spread.
 
     Raises:
         InputError: no queries, or a hit below 0 or above `trials`.
@@ -109,19 +109,19 @@ def bootstrap_interval(hits: Int[np.ndarray, " q"], trials: int = 1) -> Interval
 class PrecisionRecall(NamedTuple):
     """Precision and recall of accepting first retrievals by similarity, strictest threshold first.
 
-    They matter for loop closure, where one wrong retrieval that is accepted can spoil a map.
+    They matter for loop closure, where a single accepted wrong retrieval can spoil a map.
     """
 
     thresholds: Float[np.ndarray, " threshold"]
     """The similarities of first retrievals; one is accepted at or above the threshold."""
     precision: Float64[np.ndarray, " threshold"]
-    """Share of the accepted queries whose first retrieval is right."""
+    """Share of the accepted queries whose first retrieval is correct."""
     recall: Float64[np.ndarray, " threshold"]
-    """Share of the queries with a positive that are accepted and right."""
+    """Share of the queries with a positive that are accepted and correct."""
     average_precision: float
-    """Area under the curve as steps: each gain of recall times the precision there."""
+    """Area under the step curve: each gain in recall times the precision there."""
     recall_at_full_precision: float
-    """The largest recall without a wrong retrieval; 0 where the most similar one is wrong."""
+    """The largest recall without a wrong retrieval; 0 if the most similar one is wrong."""
 
 
 def accepted(
@@ -131,11 +131,11 @@ def accepted(
 
     Args:
         similarities: those of the first retrievals.
-        right: which first retrievals are right.
+        right: which first retrievals are correct.
 
     Returns:
-        The similarities from the highest on; and for each threshold the index in them of the last
-        accepted query, and the number of accepted queries that are right.
+        The similarities in descending order; and for each threshold, the index in them of the last
+        accepted query, and the number of accepted queries that are correct.
 
     Raises:
         InputError: a similarity is NaN.
@@ -155,17 +155,17 @@ def precision_recall(
     """Compute precision and recall over thresholds on the first retrievals' similarity.
 
     This is the single-best-match evaluation of Schubert et al. 2024, "Visual Place Recognition: A
-    Tutorial", at every possible threshold. Queries of equal similarity are accepted together. A
-    query without positives can only be accepted wrongly, and does not count in recall. Where there
-    are such queries, Recall@1, over all queries, is lower than the last recall here.
+    Tutorial", at every possible threshold. Queries of equal similarity are accepted together.
+    Accepting a query without positives is always wrong, and such queries do not count in recall. If
+    there are any, Recall@1, which is over all queries, is lower than the last recall here.
 
     Args:
         indices: database indices of each query's neighbours, best first; only the first counts.
         similarities: those of `indices`.
-        positives: the database indices that are right for each query, possibly none.
+        positives: the database indices that are correct for each query, possibly none.
 
     Returns:
-        The curve, or None if no query has a positive, for then recall is undefined.
+        The curve, or None if no query has a positive, since recall is then undefined.
 
     Raises:
         InputError: a similarity is NaN, or what `right_retrievals` raises.

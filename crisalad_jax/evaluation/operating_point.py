@@ -1,4 +1,4 @@
-"""The similarity to ask of a first retrieval, so that accepted ones are right to a precision."""
+"""The similarity threshold at which accepted first retrievals reach a given precision."""
 
 import math
 from collections.abc import Sequence
@@ -16,54 +16,54 @@ CONFIDENCE = 0.95
 
 
 class OperatingPoint(NamedTuple):
-    """What accepting first retrievals from a similarity on gives, measured on some queries.
+    """Outcome of accepting first retrievals from some similarity, measured on some queries.
 
-    If no similarity reaches the asked precision, this is the point of the highest precision, and
+    If no similarity reaches the requested precision, this is the point of highest precision, and
     `reached` is False.
     """
 
     asked: float
-    """The precision asked for, as a fraction."""
+    """The requested precision, as a fraction."""
     min_similarity: float
     """A first retrieval is accepted at this similarity or above it."""
     answered: int
     """Number of queries whose first retrieval is accepted."""
     right: int
-    """Number of these whose first retrieval is right."""
+    """Number of these whose first retrieval is correct."""
     queries: int
     """Number of all queries."""
     unknown: int
     """Number of queries without a positive: places that the database does not have."""
     unknown_answered: int
-    """Number of these that are accepted all the same, each of them wrongly."""
+    """Number of these that are accepted anyway, each of them wrongly."""
 
     @property
     def precision(self) -> float:
-        """Share of the accepted first retrievals that are right."""
+        """Share of the accepted first retrievals that are correct."""
         return self.right / self.answered
 
     @property
     def lower_bound(self) -> float:
         """Lower end of the one-sided 95 % interval of the precision by Clopper and Pearson 1934.
 
-        Queries count as independent, and the similarity as given beforehand. It was chosen on the
-        same queries, so that the bound is somewhat too high.
+        Queries are treated as independent, and the similarity as fixed in advance. It was chosen on
+        the same queries, so the bound is somewhat too high.
         """
         if not self.right:
             return 0.0
-        import scipy.special  # takes a tenth of a second, which a query does not need
+        import scipy.special  # takes a tenth of a second, and no query needs it
 
         wrong = self.answered - self.right
         return float(scipy.special.betaincinv(self.right, wrong + 1, 1 - CONFIDENCE))
 
     @property
     def recall(self) -> float:
-        """Share of all queries that are accepted and right."""
+        """Share of all queries that are accepted and correct."""
         return self.right / self.queries
 
     @property
     def reached(self) -> bool:
-        """Whether the measured precision is at least the asked one."""
+        """Whether the measured precision is at least the requested one."""
         return self.precision >= self.asked
 
 
@@ -81,24 +81,24 @@ def operating_point(
     positives: Sequence[Int[np.ndarray, " _"]],
     precision: float,
 ) -> OperatingPoint:
-    """Choose the similarity that leaves the most recall at a precision.
+    """Choose the similarity that gives the highest recall at a precision.
 
-    These are thresholds of the curve of `precision_recall`. Queries of equal similarity are
-    accepted together. A query without positives is wrong whenever it is accepted, and recall is of
-    all queries, so that it is Recall@1 where everything is accepted.
+    The candidates are the thresholds of `precision_recall`. Queries of equal similarity are
+    accepted together. Accepting a query without positives is always wrong. Recall is over all
+    queries, so it is Recall@1 if everything is accepted.
 
     Args:
         indices: database indices of each query's neighbours, best first; only the first counts.
         similarities: those of `indices`.
-        positives: the database indices that are right for each query, possibly none.
-        precision: share of the accepted first retrievals that must be right, above 0 to 1.
+        positives: the database indices that are correct for each query, possibly none.
+        precision: share of accepted first retrievals that must be correct, above 0 and at most 1.
 
     Returns:
-        The lowest such similarity, rounded down as far as it accepts the same queries; where no
-        similarity reaches the precision, the one of the highest precision.
+        The lowest such similarity, rounded down as far as it accepts the same queries; if no
+        similarity reaches the precision, the one with the highest precision.
 
     Raises:
-        InputError: such a precision, a similarity that is NaN, or what `right_retrievals` raises.
+        InputError: a precision out of range, a NaN similarity, or what `right_retrievals` raises.
 
     Example:
         >>> import numpy as np
@@ -140,21 +140,21 @@ def _rounded_down(value: float, below: float) -> float:
 
 
 def to_json(point: OperatingPoint) -> dict[str, Any]:
-    """Put an operating point into JSON values by name."""
+    """Convert an operating point to JSON values by name."""
     names = ("precision", "lower_bound", "recall", "reached")
     return point._asdict() | {name: getattr(point, name) for name in names}
 
 
 _FEWEST = 3
-"""Answers that a map's similarity rests on at least."""
+"""Minimum number of answers that a map's similarity must rest on."""
 
 
 def check_supported(point: OperatingPoint, source: str) -> None:
-    """Check that a similarity rests on more than a coincidence; `caveats` tell what it shows.
+    """Check that a similarity does not rest on a coincidence; `caveats` says what it shows.
 
     Args:
         point: what was measured.
-        source: the set, for the message.
+        source: name of the set, for the message.
 
     Raises:
         InputError: there are fewer than three answers.
@@ -169,9 +169,9 @@ def check_supported(point: OperatingPoint, source: str) -> None:
 
 
 def caveats(point: OperatingPoint) -> list[str]:
-    """Say in sentences what an operating point does not show; none where it shows what was asked.
+    """Describe what an operating point does not show; nothing if it shows what was requested.
 
-    Each is of at most one line, and begins with a small letter, to stand behind a name.
+    Each caveat is at most one line, and starts in lower case so that it can follow a name.
     """
     asked = f"{100 * point.asked:g} %"
     measured = f"{point.right} of {point.answered} answers were right"
@@ -186,7 +186,7 @@ def caveats(point: OperatingPoint) -> list[str]:
         f"rests on few queries: {measured}, which shows a precision of at least "
         f"{100 * point.lower_bound:.1f} % (95 % confidence)"
     )
-    if point.right == point.answered and point.asked < 1:  # which no number of queries shows
+    if point.right == point.answered and point.asked < 1:  # no number of queries shows 100 %
         enough = math.ceil(math.log(1 - CONFIDENCE) / math.log(point.asked))
         sure += f"; {asked} takes {enough} answers, all of them right"
     return [sure]

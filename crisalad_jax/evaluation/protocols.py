@@ -13,20 +13,20 @@ PREFIX = "published:"
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """The batches of a published evaluation: images in the order of names, each side apart."""
+    """The batches of a published evaluation: images in the order of their names, sides separate."""
 
     sizes: Mapping[str, int]
-    """Images in a batch, by a part of the set's name in small letters."""
+    """Batch size, by a lower-case part of the set's name."""
     otherwise: int | None
-    """Images in a batch of any other set; None where none is known."""
+    """Batch size for any other set; None if unknown."""
     source: str
     """Where these sizes are from."""
 
     def batch_size(self, name: str, benchmark: Benchmark) -> int:
-        """Return how many images of a set are in a batch.
+        """Return the batch size for a set.
 
         Raises:
-            InputError: no size is known of the set, or its images are in another order.
+            InputError: no size is known for the set, or its images are in another order.
         """
         words = benchmark.name.lower()
         size = next((n for key, n in self.sizes.items() if key in words), self.otherwise)
@@ -45,7 +45,7 @@ class Protocol:
 
 
 _SAGE = {26: "nordland", 20: "eynsham", 16: "msls tokyo", 8: "pitts", 2: "sped amstertime"}
-"""Sets by the images in a batch."""
+"""Sets by batch size."""
 PROTOCOLS: Mapping[str, Protocol] = {
     "cricavpr": Protocol({"pitts": 8}, 16, "Lu et al., CVPR 2024: 8 of Pittsburgh, 16 of others"),
     "crisalad": Protocol({}, 16, "Xu et al. 2025, section 4: 16"),
@@ -59,10 +59,10 @@ PROTOCOLS: Mapping[str, Protocol] = {
 
 
 def check_groupings(texts: Sequence[str]) -> list[str]:
-    """Check groupings, published ones too, and return the kinds of `Grouping` that they ask for.
+    """Check groupings, including published ones, and return the kinds of `Grouping` in them.
 
     Raises:
-        InputError: what `parse_groupings` raises, or there is no such published one.
+        InputError: what `parse_groupings` raises, or there is no such published grouping.
     """
     for text in texts:
         if text.startswith(PREFIX):
@@ -74,12 +74,12 @@ def check_groupings(texts: Sequence[str]) -> list[str]:
 def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
     """Make the groupings of an evaluation, in order and without repeats.
 
-    A published one is followed by the honest ones of as many images: each alone, in random order,
-    and without those of the own place.
+    A published grouping is followed by the honest ones of the same batch size: single images,
+    random order, and no other images of the same place.
 
     Args:
-        texts: each as `Grouping.parse` reads it, or `published:NAME` of `PROTOCOLS`.
-        benchmark: what is evaluated.
+        texts: each as `Grouping.parse` reads it, or `published:NAME` with a name in `PROTOCOLS`.
+        benchmark: the evaluated benchmark.
 
     Raises:
         InputError: what `Protocol.batch_size` raises.
@@ -96,7 +96,7 @@ def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
 
 
 def _expanded(texts: Sequence[str], size_of: Callable[[str], int]) -> Iterator[str]:
-    """Yield groupings; a published name gives those that it is short for."""
+    """Yield groupings, with published names expanded."""
     for text in texts:
         if text.startswith(PREFIX):
             size = size_of(text.removeprefix(PREFIX))
@@ -106,7 +106,7 @@ def _expanded(texts: Sequence[str], size_of: Callable[[str], int]) -> Iterator[s
 
 
 def protocol_notes(texts: Sequence[str]) -> list[str]:
-    """Say where the sizes of published groupings are from, a line for each."""
+    """Return the source of the batch sizes of each published grouping, one line each."""
     names = [text.removeprefix(PREFIX) for text in texts if text.startswith(PREFIX)]
     return [
         f"{PREFIX}{name}: batches in the order of names, each side apart "

@@ -1,4 +1,4 @@
-"""The settings of an evaluation in JSON and in words: without them its recalls mean nothing."""
+"""Settings of an evaluation, as JSON and as text: without them its recalls mean nothing."""
 
 import os
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _RECALLS = (
 
 
 class Record(NamedTuple):
-    """What is written and printed of an evaluation, besides its tables."""
+    """What is written and printed for an evaluation, in addition to its tables."""
 
     settings: dict[str, Any]
     """All settings that decide the results, as JSON values by name."""
@@ -40,19 +40,19 @@ def evaluation_record(
     model_name: str,
     **asked: Any,
 ) -> Record:
-    """Record what an evaluation found, with its settings.
+    """Record the results of an evaluation, with its settings.
 
     Args:
         results: what `evaluate` returned.
-        benchmark: what was evaluated on.
-        config: the model.
-        model_name: which weights, for each row.
-        **asked: what `crisalad evaluate` was asked for: the files `weights` (None is an untrained
-            model), `pca` and `rerank_weights` (None is the first stage's), `groupings`,
+        benchmark: the evaluated benchmark.
+        config: the model's configuration.
+        model_name: name of the weights, for each row.
+        **asked: the options of `crisalad evaluate`: the files `weights` (None for an untrained
+            model), `pca` and `rerank_weights` (None for those of the first stage), `groupings`,
             `batch_size`, `seed`, `seeds`, `dtype` and `rerank`.
 
     Returns:
-        The record, whose settings `write_report` takes.
+        The record; `write_report` takes its settings.
 
     Example:
         >>> import shutil
@@ -89,7 +89,7 @@ def evaluation_record(
 
 
 def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> list[str]:
-    """Explain a table of results in words, a paragraph for each thing that it shows.
+    """Explain a table of results as text, with a paragraph for each thing that it shows.
 
     Args:
         results: what `evaluate` returned.

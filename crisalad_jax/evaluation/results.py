@@ -25,7 +25,7 @@ from crisalad_jax.retrieval.grouping import Grouping
 from crisalad_jax.retrieval.neighbours import Neighbours
 
 ANY = "any"
-"""The grouping of a model whose descriptors depend on no batch."""
+"""Grouping of a model whose descriptors do not depend on the batch."""
 
 
 class Scores(NamedTuple):
@@ -34,9 +34,9 @@ class Scores(NamedTuple):
     recalls: Mapping[int, float]
     """Recall@K as a fraction, by K."""
     average_precision: float | None
-    """See `PrecisionRecall`; None where no query has a positive."""
+    """See `PrecisionRecall`; None if no query has a positive."""
     recall_at_full_precision: float | None
-    """See `PrecisionRecall`; None where no query has a positive."""
+    """See `PrecisionRecall`; None if no query has a positive."""
 
 
 @brief
@@ -47,7 +47,7 @@ class Skipped(NamedTuple):
     database: tuple[int, ...] = ()
 
     def rest_of(self, benchmark: Benchmark) -> Benchmark:
-        """Return the benchmark without these images, which the results are of."""
+        """Return the benchmark without these images, to which the results refer."""
         queries = np.ones(len(benchmark.queries), bool)
         database = np.ones(len(benchmark.database), bool)
         queries[list(self.queries)] = database[list(self.database)] = False
@@ -56,49 +56,49 @@ class Skipped(NamedTuple):
 
 @brief
 class GroupingResult(NamedTuple):
-    """The result of a benchmark under one grouping."""
+    """The result on a benchmark under one grouping."""
 
     grouping: str
-    """Text that `Grouping.parse` reads; `any` if the model's descriptors depend on no batch."""
+    """Text that `Grouping.parse` reads; `any` if descriptors do not depend on the batch."""
     recalls: Mapping[int, float]
     """Recall@K as a fraction, by K: the mean over the seeds."""
     neighbours: Neighbours
-    """The nearest database images of every query, best first: those of the first seed. Where images
-    were `skipped`, both count in the benchmark without them, `skipped.rest_of(benchmark)`."""
+    """The nearest database images of every query, best first, for the first seed. If images were
+    `skipped`, both sides are numbered without them, as in `skipped.rest_of(benchmark)`."""
     intervals: Mapping[int, Interval] = MappingProxyType({})
     """95 % intervals of Recall@K over the queries, by K: see `metrics.bootstrap_interval`."""
     query_share: float | None = None
-    """Share of same-place images among the others that a query looked at: the mean over queries and
-    seeds; None where no query looked at another."""
+    """Share of same-place images among the others that a query attends to: the mean over queries
+    and seeds; None if no query attends to another."""
     database_share: float | None = None
     """The same share for the database images."""
     mirrored_share: float | None = None
-    """How far a query's batch is known again in its right answer's: `leakage.mirrored_share`."""
+    """How closely a query's batch mirrors its correct answer's: `leakage.mirrored_share`."""
     over_single: Difference | None = None
-    """Recall@1 less that of images described alone; None without such a row, or of it."""
+    """Recall@1 minus that of single-image descriptors; None for that row, or without it."""
     precision_recall: PrecisionRecall | None = None
-    """The curve of the first seed; None where no query has a positive."""
+    """The curve of the first seed; None if no query has a positive."""
     average_precision: float | None = None
-    """Mean over the seeds; None where no query has a positive."""
+    """Mean over the seeds; None if no query has a positive."""
     recall_at_full_precision: float | None = None
-    """Mean over the seeds; None where no query has a positive."""
+    """Mean over the seeds; None if no query has a positive."""
     spread: Scores | None = None
     """Sample standard deviation over the seeds; None with fewer than two."""
     by_seed: Mapping[int, Scores] = MappingProxyType({})
-    """Scores of each shuffle, by the seed that repeats it alone; empty if nothing is random."""
+    """Scores of each shuffle, by the seed that reproduces it; empty if nothing is random."""
     firsts: Bool[np.ndarray, "seed q"] | None = None
-    """Whether the first retrieval was right, for each seed and query."""
+    """Whether the first retrieval was correct, for each seed and query."""
     rerank: str | None = None
     """The second stage, as `reranking.parse_reranking` reads it; its scores replace the
-    similarities of the retrievals that it re-ranked. None is the first stage alone."""
+    similarities of the retrievals that it re-ranked. None means no second stage."""
     skipped: Skipped = Skipped()
     """The unreadable images that were left out, the same under every grouping."""
     operating_point: OperatingPoint | None = None
-    """The similarity that leaves the asked precision, of the first seed; None if none was asked."""
+    """The similarity with the requested precision, for the first seed; None unless requested."""
 
     @property
     def label(self) -> str:
-        """Name that no other result of an evaluation has."""
+        """Name that is unique among the results of an evaluation."""
         return self.grouping if self.rerank is None else f"{self.grouping} + {self.rerank}"
 
 
@@ -116,11 +116,11 @@ def summarise(
 
     Args:
         grouping: its name.
-        rankings: seed -> neighbours; one ranking where nothing is random.
-        positives: the database indices that are right for each query.
+        rankings: seed -> neighbours; one ranking if nothing is random.
+        positives: the database indices that are correct for each query.
         ks: the values of K.
-        is_random: whether the rankings differ by their seeds.
-        precision: of the operating point; None for no such point.
+        is_random: whether the rankings differ between seeds.
+        precision: of the operating point; None for no operating point.
         **known: other fields of `GroupingResult`, such as its shares.
 
     Raises:
@@ -155,7 +155,7 @@ def summarise(
 
 
 def over_single(results: Sequence[GroupingResult]) -> list[GroupingResult]:
-    """Compare results with that of images described alone, of the same second stage."""
+    """Compare results with those of single-image descriptors under the same second stage."""
     alone = {each.rerank: each.firsts for each in results if each.grouping == "single"}
 
     def difference(result: GroupingResult) -> Difference | None:
@@ -185,7 +185,7 @@ def percent(fraction: float) -> str:
 
 
 def to_json(result: GroupingResult) -> dict[str, Any]:
-    """Put a result without its neighbours into JSON values; recalls and shares are fractions."""
+    """Convert a result to JSON values, without neighbours; recalls and shares are fractions."""
     sides, size, gain = (ANY, ANY), None, result.over_single
     if result.grouping != ANY:
         grouping = Grouping.parse(result.grouping)

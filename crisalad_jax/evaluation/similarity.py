@@ -1,4 +1,4 @@
-"""The similarities of all queries and a whole database, reduced to the size of a picture."""
+"""The similarities between all queries and the database, reduced to the size of a picture."""
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -12,10 +12,10 @@ _QUERY_CHUNK, _DATABASE_CHUNK = 1024, 8192
 def similarity_map(
     database: Float[np.ndarray, "n d"], queries: Float[np.ndarray, "q d"], *, most: int = 400
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Compute a picture of all similarities of queries (rows) and database (columns).
+    """Compute a picture of all similarities between queries (rows) and database (columns).
 
-    A side of more than `most` images shares its cells (`cells_of`): a cell is the largest of its
-    similarities. Memory depends on the blocks that are compared at a time, not on the sets.
+    If a side has more than `most` images, several share a cell (`cells_of`), which holds the
+    largest similarity. Memory depends on the blocks that are compared at a time, not on the sets.
 
     Raises:
         InputError: what `retrieval.search` raises.
@@ -48,7 +48,7 @@ def _cells(
 
 
 class FirstSimilarities:
-    """Observer for `evaluate` that keeps the picture of the first grouping's similarities."""
+    """Observer for `evaluate` that stores the picture of the first grouping's similarities."""
 
     map: Float32[np.ndarray, "rows columns"] | None = None
     """The picture by `similarity_map`; None before the first grouping is described."""

@@ -1,1 +1,1 @@
-"""Whole experiments: the demo, comparisons of methods, reports."""
+"""End-to-end experiments: the demo, comparisons of methods, reports."""

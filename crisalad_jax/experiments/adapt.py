@@ -46,16 +46,16 @@ Path = str | os.PathLike[str]
 
 @brief
 class Adapted(NamedTuple):
-    """What an adaptation gained, and where it cost something."""
+    """What an adaptation gained, and what it cost elsewhere."""
 
     steps: int
     held_out: tuple[float, float]
-    """Recall of held-out frames by `TrainConfig.monitor`, before and after. The copies of them that
-    ask are others than those that stopped the training."""
+    """Recall of held-out frames by `TrainConfig.monitor`, before and after. These queries are
+    not the copies that stopped the training."""
     others: dict[str, tuple[float, Difference]]
     """Recall@1 of each watched set before, and its change."""
     weights: pathlib.Path | None
-    """The adapted weights; None where held-out frames gained nothing."""
+    """The adapted weights; None if held-out frames gained nothing."""
     replaced: bool
     """Whether the map was rebuilt with them."""
 
@@ -81,36 +81,36 @@ def adapt(
 ) -> Adapted:
     """Fit the model of a map to its place, or resume the run in `out`.
 
-    Images of a place are those within `place_radius`, of a map without positions so many
-    consecutive ones, and without `place_frames` each image by itself, under two augmentations. A
-    fifth of the images is held out. Augmented copies of them ask the rest of the map: two of each
-    decide how long to train, and two others whether anything was gained.
+    A place is the images within `place_radius`; in a map without positions, it is `place_frames`
+    consecutive images, or by default a single one under two augmentations. A fifth of the images is
+    held out. Augmented copies of them query the rest of the map: two of each decide how long to
+    train, and two others whether anything was gained.
 
     Args:
         config: how to train, usually `recipe(name="adapt", model=...)` with the map's model.
         folder: the map, whose images must be where they were indexed.
         out: folder for the run, the held-out pictures and `adapted.safetensors`.
-        weights: the map's weights, if they were moved; None is the path that the map records.
+        weights: the map's weights, if they were moved; None for the path that the map records.
         images: more images of the place to train on, as `extract` takes them; they don't join the
             map.
-        place_radius: metres from a place's centre, within which its images are, for a map with
-            positions; None is 10.
+        place_radius: metres from a place's centre within which its images lie, for a map with
+            positions; None for 10.
         place_frames: number of consecutive images that are a place, for a map without positions.
         watch: evaluation sets of other places, whose recall is compared before and after.
-        most_lost: most that the Recall@1 of a watched set may fall, a fraction; the map is not
-            replaced where it falls more.
+        most_lost: largest accepted drop in Recall@1 of a watched set, as a fraction; the map is
+            not replaced if any drops more.
         replace: whether to rebuild the map with the adapted model; see `remake_map`.
-        fps: frames a second taken of videos and logs among `images`.
+        fps: frames per second taken from videos and logs among `images`.
         topic: the topic of images in a log among `images`.
         reading: how images are read.
         callbacks: see `fit`.
         say: called with each line to print.
 
     Returns:
-        What was gained. `out` has it as `adapted.json`.
+        What was gained, which is also written to `adapted.json` in `out`.
 
     Raises:
-        InputError: another model than the map's; images that are gone; `place_frames` for a map
+        InputError: a model other than the map's; missing images; `place_frames` for a map
             with positions, or `place_radius` for one without; too few images; `out` within the map;
             `replace` for a map that cannot be rebuilt; a map that was rebuilt with `out`'s weights;
             what `open_sources`, `open_benchmark` and `fit` raise.
@@ -167,7 +167,7 @@ def adapt(
     split = split_images(sources, config.seed, **grouping)
     count = len(split.training.names)
     require(count > 1, f"{folder}: found images of {count} place, expected several to tell apart")
-    # Neighbours never share a batch; half of those apart leaves the sampler a choice.
+    # Neighbours never share a batch; half of the separate places leaves the sampler a choice.
     batch = min(config.places_per_batch, max(2, count_apart(split.training) // 2))
     config = dataclasses.replace(config, places_per_batch=batch)
     check_run(out / "run", config)
@@ -225,7 +225,7 @@ def adapt(
 
 
 def _check_model(config: TrainConfig, model: Model, folder: pathlib.Path) -> None:
-    """Check that a map's model is what is to be trained, but for dropout and types."""
+    """Check that a map's model is the one to be trained, apart from dropout and types."""
     expected = with_non_semantic_fields_of(config.model, model.config)
     prepared = {name: getattr(model.config, name) for name in ("image_size", "preprocessing")}
     expected = dataclasses.replace(expected, **prepared)
@@ -240,7 +240,7 @@ def _more(
     topic: str | None,
     reading: Reading,
 ) -> list[ImageSource]:
-    """List more images of a map's place, with positions as the map's."""
+    """List more images of a map's place, with positions in the map's axes and zone."""
     if not images:
         return []
     found = open_sources(images, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
@@ -259,14 +259,14 @@ def _more(
 
 
 def _firsts(model: Model, benchmark: Benchmark, reading: Reading) -> Bool[np.ndarray, "1 q"]:
-    """Return whether each query's first retrieval is right."""
+    """Return whether each query's first retrieval is correct."""
     (found,) = evaluate(model, benchmark, groupings=("single",), reading=reading)
     assert found.firsts is not None
     return found.firsts
 
 
 def _recall(model: Model, benchmark: Benchmark, config: TrainConfig, reading: Reading) -> float:
-    """Return what the run's validations monitor, as they measure it."""
+    """Return the metric that the run's validations monitor, measured in the same way."""
     as_in_fit = Reading(on_bad_image=reading.on_bad_image, quiet=True)
     return Validator(config, benchmark, as_in_fit).validate(model.params).monitored
 

@@ -1,4 +1,4 @@
-"""The demo: render a synthetic city, train on it and evaluate, without data of one's own."""
+"""The demo: render a synthetic city, train on it and evaluate; it needs no data set."""
 
 import dataclasses
 import functools
@@ -66,7 +66,7 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
 
     Raises:
         InputError: `out` holds other files, or a demo of another configuration; or another process
-            writes there.
+            is writing there.
     """
     with lock(out):
         check_no_links(out)
@@ -126,7 +126,7 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
 
 
 def demo_recipe(config: DemoConfig) -> TrainConfig:
-    """Make the recipe of `tiny` for four images a place, whose light varies enough by itself."""
+    """Return the `tiny` recipe for four images per place, whose light already varies enough."""
     return dataclasses.replace(
         recipe("tiny"),
         augmentation=LightAugmentConfig(),

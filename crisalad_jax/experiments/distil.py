@@ -65,11 +65,11 @@ def distil(
         out: folder of the run; see `fit`.
         weights: the student's weights to start from, or a published model's name.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
-        validation_images: folder of the images that a .mat file or .npy lists at `validation` name.
-        fps: frames a second taken of videos and logs.
+        validation_images: folder of the images that a .mat file or .npy lists in `validation` name.
+        fps: frames per second taken from videos and logs.
         topic: the topic of images in a log.
         reading: how images are read.
-        cache_gb: most gigabytes of images at addresses that are cached on this host's disk.
+        cache_gb: maximum gigabytes of remote images cached on this host's disk.
         callbacks: see `fit`.
         say: called with each line to print.
 
@@ -171,7 +171,7 @@ def teachers_descriptors(
     paths = [places.path(image) for image in range(len(places.files))]
     states = for_each(lambda path: state_of(file_of(path)), paths)
     files = [f"{path} {state}" for path, state in zip(paths, states, strict=True)]
-    config = to_plain(teacher.config)  # whose image size and types are not in the model's hash
+    config = to_plain(teacher.config)  # the model's hash leaves out image size and types
     digest = digest_of(files, {"teacher": describer_of(teacher).digest, "config": config})
     file = user_cache() / "teachers" / f"{digest[:16]}.npy"
     listed, found = read_descriptors(file) if file.exists() else ([], None)

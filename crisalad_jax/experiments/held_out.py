@@ -1,4 +1,4 @@
-"""Divide the images of a map: places to train on, and held-out frames that ask the rest."""
+"""Split the images of a map: places to train on, and held-out frames that query the rest."""
 
 import dataclasses
 import pathlib
@@ -23,25 +23,25 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 
 SHARE, MOST = 0.2, 100
-"""Share of a map's images that is held out, and the most of them."""
+"""Share of a map's images that is held out, and their maximum number."""
 CHOOSING, JUDGING = range(2), range(2, 4)
-"""Changed copies of a held-out image that stop the training, and those that say what it gained:
+"""Augmented copies of a held-out image that stop the training, and those that measure the gain:
 the best of several validations is too high."""
 
 
 class Split(NamedTuple):
-    """The images of a map, and more of its place, divided."""
+    """The images of a map, and more of its place, after the split."""
 
     source: ImageSource
-    """All of them, those of the map first."""
+    """All images, those of the map first."""
     training: Places
-    """Places of those that are not held out."""
+    """Places made of the images that are not held out."""
     answers: dict[int, list[int]]
-    """Held-out image -> its right answers among the others; itself where it has none."""
+    """Held-out image -> its correct answers among the others; itself if it has none."""
     database: list[int]
-    """Images of the map that held-out ones ask."""
+    """Images of the map that held-out ones query."""
     rule: str
-    """What is a right answer, in words."""
+    """Description of a correct answer."""
 
 
 def split_images(
@@ -51,11 +51,11 @@ def split_images(
     place_radius: float | None = None,
     place_frames: int | None = None,
 ) -> Split:
-    """Hold out some of a map's images, and make places of the rest.
+    """Hold out some of a map's images, and group the rest into places.
 
     Args:
         sources: the map's images, and more of its place.
-        seed: draws the held-out images.
+        seed: seed that draws the held-out images.
         place_radius: metres within which images show the same place.
         place_frames: number of consecutive images that show it; without both each image is a place.
 
@@ -89,7 +89,7 @@ def _chosen(source: ImageSource, numbers: Sequence[int]) -> ImageSource:
 
 
 def _near(source: ImageSource, radius: float) -> list[list[int]]:
-    """List the others within a radius of each image; none of an image without a position."""
+    """List the others within a radius of each image; none for an image without a position."""
     near: list[list[int]] = [[] for _ in source.names]
     if source.positions is None:
         return near
@@ -104,7 +104,7 @@ def _near(source: ImageSource, radius: float) -> list[list[int]]:
 
 
 def _consecutive(source: ImageSource, frames: int) -> list[list[int]]:
-    """List the others of each image's sequence that are less than so many frames away."""
+    """List the others of each image's sequence that are less than `frames` frames away."""
     near: list[list[int]] = [[] for _ in source.names]
     for numbers in by_sequence(source.paths):
         for place, image in enumerate(numbers):
@@ -114,7 +114,7 @@ def _consecutive(source: ImageSource, frames: int) -> list[list[int]]:
 
 
 def with_repeats(places: Places, images: int) -> Places:
-    """Name the images of a small place again, in turn, until it has so many.
+    """Repeat the images of a small place, in turn, until it has that many.
 
     A batch then has several augmentations of one image.
     """
@@ -127,7 +127,7 @@ def with_repeats(places: Places, images: int) -> Places:
 
 
 def count_apart(places: Places) -> int:
-    """Count places that may be in one batch: each in turn that none before it is near."""
+    """Count places that can share a batch: each in turn that is not near an earlier one."""
     taken = set[int]()
     for place in range(len(places.names)):
         if places.near is None or taken.isdisjoint(places.near[place].tolist()):
@@ -142,17 +142,17 @@ def held_out_benchmark(
     copies: Sequence[int],
     on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
-    """Write augmented copies of the held-out images, and make the set in which they ask the map.
+    """Write augmented copies of the held-out images, and make the set in which they query the map.
 
     Args:
-        config: the run's, whose augmentation changes the copies as it changes training images.
+        config: the run's; its augmentation changes the copies as it changes training images.
         split: the images.
         folder: where the copies are written.
-        copies: numbers of the copies of each image, which draw how they are changed.
+        copies: numbers of the copies of each image, which seed the augmentation.
         on_bad_image: whether an unreadable image is left out.
 
     Raises:
-        InputError: an image cannot be read, or none can, or the folder not be written to.
+        InputError: an image cannot be read, or none can, or the folder cannot be written to.
     """
     model, seed = config.model, config.seed
     how = Preparation(model.input_size, model.preprocessing.for_training())

@@ -1,4 +1,4 @@
-"""Write a run as the hub's users expect a model: weights, configuration, and a model card."""
+"""Write a run in the form that the hub expects: weights, configuration, and a model card."""
 
 import contextlib
 import json
@@ -32,7 +32,7 @@ from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.version import VERSION
 
 WEIGHTS = ("best.safetensors", "last.safetensors")
-"""Files of a run's weights; the first that is there is published."""
+"""Weight files of a run; the first one that exists is published."""
 CARD, CONFIG = "README.md", "config.json"
 _TEMPLATE = "card.md"
 
@@ -47,28 +47,28 @@ def publish(
     evaluations: Sequence[str | os.PathLike[str]] = (),
     quiet: bool = False,
 ) -> str:
-    """Write a run's model to a new folder, or to a repository at Hugging Face's hub.
+    """Write a run's model to a new folder, or to a repository on the Hugging Face Hub.
 
-    It has `model.safetensors`, `config.json` and `README.md`, a model card written from the run:
-    what it is, the data and the recipe of its training, recalls with their intervals, its licence,
+    The result has `model.safetensors`, `config.json` and `README.md`, a model card written from the
+    run: what the model is, its training data and recipe, recalls with their intervals, the licence,
     and how to use it. `load` reads the folder, and hf://OWNER/NAME.
 
     Args:
         run: the run's folder, with best.safetensors or last.safetensors.
         to: a new or empty folder, or hf://OWNER/NAME of a repository without these files.
-        licence: the weights' licence by the hub's name for it, such as apache-2.0 or
-            cc-by-nc-4.0; what they were started from and trained on may limit it.
-        data: what it was trained on, in words; None is what the run recorded.
+        licence: the licence of the weights, by the hub's name for it, such as apache-2.0 or
+            cc-by-nc-4.0; the initial weights and the training data may restrict it.
+        data: description of the training data; None for what the run recorded.
         evaluations: files that `crisalad evaluate --json` wrote for this model.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The folder, or the address of the repository's page.
 
     Raises:
-        InputError: the run has no weights; a file is missing or damaged; the folder has files, or
-            the repository; no such name of a licence; or what `upload_folder` raises.
-        ModuleNotFoundError: huggingface_hub is not installed, and `to` is at the hub.
+        InputError: the run has no weights; a file is missing or damaged; the folder or the
+            repository has files; an invalid licence name; or what `upload_folder` raises.
+        ModuleNotFoundError: huggingface_hub is not installed, and `to` is on the hub.
 
     Example:
         >>> import dataclasses
@@ -106,17 +106,17 @@ def publish(
 
 
 class _Run(NamedTuple):
-    """What is read of a run."""
+    """What is read from a run."""
 
     weights: pathlib.Path
     config: TrainConfig
     metrics: list[dict[str, Any]]
     data: dict[str, Any] | None
-    """What it recorded of its data; None of a run that `fit` made without `train`."""
+    """What it recorded of its data; None for a run that `fit` made without `train`."""
 
 
 class _Row(NamedTuple):
-    """Recalls of a table."""
+    """A row of the table of recalls."""
 
     benchmark: str
     how: str
@@ -124,7 +124,7 @@ class _Row(NamedTuple):
     intervals: Mapping[str, Sequence[float]]
 
     def cell(self, name: str) -> Cell:
-        """Format a recall, with its interval where that is known."""
+        """Format a recall, with its interval if known."""
         if name not in self.recalls:
             return Cell(NOTHING)
         ends = "-".join(map(percent, self.intervals.get(name, ())))
@@ -135,7 +135,7 @@ def _read_run(run: pathlib.Path) -> _Run:
     """Read a run, and check its weights.
 
     Raises:
-        InputError: it has none, or something is damaged.
+        InputError: it has no weights, or a file is damaged.
     """
     there = [run / name for name in WEIGHTS if (run / name).is_file()]
     if not there:
@@ -150,13 +150,13 @@ def _read_run(run: pathlib.Path) -> _Run:
 
 
 def _validation(run: _Run) -> Iterator[_Row]:
-    """Yield the recalls of the validation that chose these weights, where there was one."""
+    """Yield the recalls of the validation that chose these weights, if there was one."""
     ranks = [f"R@{k}" for k in MONITORED[run.config.monitor]]
     validations = [each for each in run.metrics if all(rank in each for rank in ranks)]
     if not validations:
         return
     last = run.weights.name == WEIGHTS[1]
-    # Of equal recalls the first counts as the best; the last weights are of the last one.
+    # Of equal recalls, the first counts as the best; the last weights belong to the last one.
     best = max(validations, key=lambda each: sum(each[rank] for rank in ranks))
     chosen = validations[-1] if last else best
     recalls = {name: value for name, value in chosen.items() if re.fullmatch(r"R@\d+", name)}
@@ -174,7 +174,7 @@ def _rows(file: str | os.PathLike[str], run: _Run) -> Iterator[_Row]:
     """Yield the results of an evaluation.
 
     Raises:
-        InputError: it is none, or of another model.
+        InputError: the file does not hold an evaluation.
     """
     values = read_json(file, "what `crisalad evaluate --json` wrote", sealed=False)
     try:
@@ -206,7 +206,7 @@ def _card(run: _Run, rows: Sequence[_Row], *, name: str, licence: str, data: str
             "Its descriptors depend on the images that are described together "
             "(`docs/evaluation.md`): the recalls below say how they were grouped."
         )
-    # JSON is YAML too, and quotes all that a name may hold.
+    # JSON is valid YAML, and quotes anything that a name may hold.
     index = json.dumps([{"name": short, "results": [_result(row) for row in rows]}])
     page = pathlib.Path(__file__).with_name(_TEMPLATE).read_text(encoding="utf-8")
     return page.format(
@@ -248,7 +248,7 @@ def _table(rows: Sequence[_Row]) -> str:
 
 
 def _result(row: _Row) -> dict[str, Any]:
-    """Put a row into the form of the hub's `model-index`, recalls in percent."""
+    """Convert a row to the form of the hub's `model-index`, with recalls in percent."""
     kind = re.sub(r"[^a-z0-9]+", "-", row.benchmark.lower()).strip("-")
     metrics = [
         {"type": f"recall_at_{name[2:]}", "name": f"{name}, {row.how}", "value": 100 * value}

@@ -1,7 +1,7 @@
 """Recordings for the viewer Rerun (https://rerun.io): queries, answers, similarities and the map.
 
-A recording has a timeline `frame`, the number of the query, and a timeline `time` where names of
-queries say when they were taken.
+A recording has a timeline `frame`, the number of the query, and a timeline `time` if the names of
+queries contain the time they were taken.
 """
 
 import contextlib
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from crisalad_jax.evaluation.results import GroupingResult
 
 _SHOWN = 3
-"""Largest number of answers to a query whose images are recorded."""
+"""Maximum number of answers per query whose images are recorded."""
 _SIDE = 480
 """Pixels of a recorded image's longer side."""
 _GREY, _GREEN, _RED = (150, 150, 150), (40, 160, 70), (210, 50, 40)
 _SINCE_1970 = 1e9
-"""Seconds from which on a time is a date."""
+"""Seconds from which a time is taken as a date."""
 
 _Spot = Sequence[float]
 _Colour = tuple[int, int, int]
@@ -46,26 +46,26 @@ _Colour = tuple[int, int, int]
 def record(
     path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = None
 ) -> Iterator["Recording"]:
-    """Write a recording, which gets its name at the end; a signal ends it too, whole.
+    """Write a recording, which gets its name once it is complete, also after a signal.
 
     Args:
         path: the file, `.rrd`.
-        root: folder of the map's images; None is where they were. One that is not there is left
-            out, and a note says so.
+        root: folder of the map's images; None for where they were. Missing images are left out,
+            with a warning.
 
     Raises:
-        InputError: the file cannot be made.
+        InputError: the file cannot be created.
     """
     interrupted = None
     with atomic_path(path) as temporary:
         stream = rr.RecordingStream("crisalad")
-        stream.set_log_time_enabled(False)  # when this file was written says nothing
+        stream.set_log_time_enabled(False)  # when this file was written does not matter
         stream.set_log_tick_enabled(False)
         stream.save(temporary)
         recording = Recording(stream, root)
         try:
             yield recording
-        except Interrupted as error:  # how a camera ends
+        except Interrupted as error:  # the normal end of a camera stream
             interrupted = error
         finally:
             recording.finish()
@@ -81,11 +81,11 @@ def record_results(
 
     Args:
         path: the file, `.rrd`.
-        benchmark: what was evaluated on, without unreadable images.
+        benchmark: the evaluated benchmark, without unreadable images.
         results: what `evaluate` returned.
 
     Raises:
-        InputError: an image cannot be read, or the file cannot be made.
+        InputError: an image cannot be read, or the file cannot be created.
     """
     truth = benchmark.ground_truth()
     spots = benchmark.database_positions
@@ -105,7 +105,7 @@ class Recording:
     """A recording of queries and their answers that is being written."""
 
     def __init__(self, stream: rr.RecordingStream, root: str | os.PathLike[str] | None) -> None:
-        """Begin without a query; see `record`."""
+        """Start without queries; see `record`."""
         self._stream, self._root = stream, root
         self._scenes: dict[str, _Scene] = {}
         self._lost: dict[pathlib.Path, InputError] = {}
@@ -121,10 +121,10 @@ class Recording:
         """Add queries with their answers, each as the next frame.
 
         Args:
-            answers: what `query` found; of one map for each label.
+            answers: what `query` found; each label belongs to one map.
             images: pixels of the queries; None reads their files.
-            right: whether each query's first answer is right; None is whether its place is known.
-            label: first part of the names of these entities, such as a grouping; "" is none.
+            right: whether each first answer is correct; None for whether the place is known.
+            label: first part of the names of these entities, such as a grouping; "" for none.
 
         Raises:
             InputError: a query's file cannot be read.
@@ -165,7 +165,7 @@ class Recording:
                 scene.move(ranked[0].image.position, _GREEN if is_good else _RED)
 
     def _map_picture(self, image: MapImage) -> np.ndarray | None:
-        """Read an image of the map; None where it is not there."""
+        """Read an image of the map; None if it is missing."""
         file = pathlib.Path(image.root if self._root is None else self._root, image.name)
         if file not in self._lost:
             try:
@@ -175,7 +175,7 @@ class Recording:
         return None
 
     def finish(self) -> None:
-        """Log the ways, and how the viewer lays all out."""
+        """Log the trajectories and the layout of the viewer."""
         if self._lost:
             first = next(iter(self._lost.values()))
             warn(
@@ -189,7 +189,7 @@ class Recording:
 
 
 class _Scene:
-    """What a recording has of one map: its positions, and the way through it."""
+    """The part of a recording for one map: its positions, and the trajectory through it."""
 
     def __init__(self, stream: rr.RecordingStream, label: str, answers: Answers) -> None:
         """Log the positions of the map's images, which do not change."""
@@ -201,17 +201,17 @@ class _Scene:
         self._way: list[tuple[_Spot, _Colour]] = []
         known = [image.position for image in answers.images if image.position is not None]
         self._has_map = bool(known)
-        # A viewer's points have 24 bits, and metres of UTM need more.
+        # The viewer's points have 24 bits of precision, and UTM metres need more.
         self._origin = np.round(np.median(known, axis=0)) if known else 0
         if known:
             self.log("map/images", self._points(known, [_GREY], 2), static=True)
 
     def log(self, name: str, entity: rr.AsComponents, *, static: bool = False) -> None:
-        """Log an entity at the present frame."""
+        """Log an entity at the current frame."""
         self._stream.log(f"{self._at}/{name}", entity, static=static)
 
     def next_frame(self, file: pathlib.Path) -> None:
-        """Set the times of what is logged from here on."""
+        """Start the next frame, and set its times."""
         self._stream.reset_time()
         self._stream.set_time("frame", sequence=self._frames)
         self._frames += 1
@@ -228,7 +228,7 @@ class _Scene:
         self.log("map/here", self._points([spot], [colour], 7))
 
     def log_matches(self, query: np.ndarray, answer: np.ndarray, check: Verification) -> None:
-        """Log two images side by side, and lines between the points that match."""
+        """Log two images side by side, and lines between matching points."""
         self._has_matches = True
         (left, ours), (right, theirs) = _small(query), _small(answer)
         both = np.zeros((max(len(left), len(right)), left.shape[1] + right.shape[1], 3), np.uint8)
@@ -244,7 +244,7 @@ class _Scene:
         self.log("inliers", rr.Scalars(check.inliers))
 
     def finish(self) -> rrb.Container:
-        """Log the way so far, and return the views of all."""
+        """Log the trajectory so far, and return the views."""
         at = self._at or "/"
         if self._way:
             spots, colours = zip(*self._way, strict=True)
@@ -289,7 +289,7 @@ class _Scene:
 
 
 def _small(image: np.ndarray) -> tuple[np.ndarray, float]:
-    """Shrink an image, and return the pixels of a side that are one of the image's, too."""
+    """Shrink an image, and return it with the scale factor."""
     factor = min(1.0, _SIDE / max(image.shape[:2]))
     return cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), factor
 

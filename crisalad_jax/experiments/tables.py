@@ -1,4 +1,4 @@
-"""Tables for the terminal, for Markdown, LaTeX and for a page, and files of text."""
+"""Tables for the terminal, Markdown, LaTeX and HTML pages, and text files."""
 
 import csv
 import io
@@ -15,13 +15,13 @@ from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.output import printable
 
 NOTHING = "-"
-"""Cell of what is unknown or does not apply."""
+"""Cell for a value that is unknown or does not apply."""
 _NAMED = {"\\": "backslash", "~": "asciitilde", "^": "asciicircum"}
 _NAMED |= {"|": "bar", "<": "less", ">": "greater"}
 _IN_LATEX = str.maketrans(
     {letter: rf"\text{name}{{}}" for letter, name in _NAMED.items()}
     | {letter: rf"\{letter}" for letter in "&%$#_{}"}
-    # At the start of a line these would belong to the end of the line before.
+    # At the start of a line, LaTeX would take these as arguments of the previous line's end.
     | {letter: f"{{{letter}}}" for letter in "[]*"}
     | {"±": r"$\pm$", "Δ": r"$\Delta$", "\N{EN DASH}": "--"}
 )
@@ -32,8 +32,8 @@ class Cell(NamedTuple):
 
     text: str
     note: str = ""
-    """What is less important, as an interval: its lines are below the text in a page and in a table
-    that is `stacked`, elsewhere after it."""
+    """Secondary text, such as an interval: its lines are below the text in a page and in a
+    `stacked` table, elsewhere after it."""
     kind: str = ""
     """How a page shows it: best, right or wrong."""
 
@@ -44,7 +44,7 @@ class Table(NamedTuple):
     headers: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     labels: int = 1
-    """Number of the first columns, which are words; the others are numbers, at the right."""
+    """Number of leading columns that hold text; the others hold numbers, right-aligned."""
     title: str = ""
     stacked: bool = False
     """Whether notes are below their texts in the terminal too, with lines between the rows."""
@@ -67,9 +67,9 @@ class Table(NamedTuple):
         return table
 
     def _ends(self) -> list[bool]:
-        """Return whether a line is below each row: before a sum, and between groups of rows.
+        """Return whether each row has a line below it: before a sum, and between groups of rows.
 
-        Of three labels or more the first is a group's, where rows share it.
+        With three or more labels, the first one names a group if rows share it.
         """
         first = [row[0] for row in self.rows]
         groups = self.labels > 2 and len(set(first)) < len(first)
@@ -109,7 +109,7 @@ def _in_line(cell: Cell, parting: str = " ") -> str:
 
 
 def _in_latex(text: str, is_number: bool = False) -> str:
-    """Escape a text; of numbers set a minus, or a dash between the ends of an interval."""
+    """Escape a text; in numbers, typeset minus signs and the dashes of intervals."""
     text = printable(text).translate(_IN_LATEX)
     if is_number:
         text = re.sub(r"(?<=\d)-(?=\d)", "--", text)
@@ -164,6 +164,6 @@ def _no_formula(value: Any) -> Any:
 
 
 def write_text(path: pathlib.Path, text: str) -> None:
-    """Write a file of UTF-8, whole or not at all; other bytes, as of names, become escapes."""
+    """Write a UTF-8 file atomically; other bytes, as in file names, become escapes."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")

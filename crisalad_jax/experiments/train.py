@@ -54,26 +54,26 @@ def train(
 
     Args:
         config: how to train.
-        data: places, in a layout that `read_places` reads, here or at an address; the sets of
-            `config.mixture` by name, in such layouts; for a recipe that mines tuples, a set that
-            `open_benchmark` reads, such as pitts30k_train.mat.
+        data: places, in a layout that `read_places` reads, local or remote; or the sets of
+            `config.mixture` by name, in such layouts; or, for a recipe that mines tuples, a set
+            that `open_benchmark` reads, such as pitts30k_train.mat.
         place_radius: metres within which images of a source with positions are a place; see
-            `read_places`, as for the four that follow.
+            `read_places`, also for the next four.
         place_frames: number of consecutive images that are a place.
         positions: table of positions.
-        fps: frames a second taken of videos and logs.
+        fps: frames per second taken from videos and logs.
         topic: the topic of images in a log.
-        images: folder of the images that such a file names.
+        images: folder of the images that a file such as pitts30k_train.mat names.
         out: folder of the run; see `fit`.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
-        validation_images: folder of the images that a .mat file or .npy lists at `validation` name.
-        weights: a whole model to start from, or a published one's name. `config.model` is what is
-            trained and saved; `recipe(model=load(weights).config)` has the file's.
+        validation_images: folder of the images that a .mat file or .npy lists in `validation` name.
+        weights: a complete model to start from, or a published model's name. `config.model` is
+            what is trained and saved; `recipe(model=load(weights).config)` has the file's.
         backbone: a checkpoint to start the backbone from, or a published model's name.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
-        num_threads: number of threads that read the training images; None for one a usable core.
-        shard_state: keep what trains and its moments in shards, one a device.
-        cache_gb: most gigabytes of images at addresses that are cached on this host's disk.
+        num_threads: number of threads that read the training images; None for one per usable core.
+        shard_state: shard the trainable parameters and their moments, one shard per device.
+        cache_gb: maximum gigabytes of remote images cached on this host's disk.
         callbacks: see `fit`.
         quiet: no progress bars.
         say: called with each line to print.
@@ -83,7 +83,7 @@ def train(
 
     Raises:
         InputError: what `read_start`, `read_places`, `read_query_set`, `open_benchmark` and `fit`
-            raise; `out` holds something else than a run with this configuration.
+            raise; `out` holds something other than a run with this configuration.
         Interrupted: what `fit` raises; the same call resumes.
 
     Example:

@@ -1,6 +1,6 @@
-"""Multi-head attention: its projections, and products of matrices in the order of the platform.
+"""Multi-head attention: its projections, and matrix products laid out to suit the platform.
 
-On an accelerator self-attention is fused where a kernel takes it (`attention_fused`).
+On an accelerator, self-attention is fused if a kernel supports it (`attention_fused`).
 """
 
 import functools
@@ -47,14 +47,14 @@ class Attention:
 
 
 class Rotation(NamedTuple):
-    """The angles of a sequence's last tokens, one for each pair of numbers of a head."""
+    """Rotation angles of a sequence's last tokens, one for each pair of a head's dimensions."""
 
     cosines: Float[np.ndarray, "patch pair"]
     sines: Float[np.ndarray, "patch pair"]
 
 
 def init_torch_attention(qkv_key: PRNGKeyArray, proj_key: PRNGKeyArray, dim: int) -> Attention:
-    """Draw parameters as torch's `nn.MultiheadAttention`: Glorot-uniform inputs, zero biases."""
+    """Draw parameters like torch's `nn.MultiheadAttention`: Glorot-uniform inputs, zero biases."""
     bound = math.sqrt(6 / (dim + 3 * dim))
     qkv = random_init.uniform(qkv_key, (dim, 3 * dim), minval=-bound, maxval=bound)
     proj = init_linear(proj_key, dim, dim).weight
@@ -77,13 +77,13 @@ def attention(
         params: the projections.
         x: tokens.
         heads: number of heads.
-        length: number of first tokens that are not padding, to which alone tokens attend; None is
+        length: number of leading tokens that are not padding; only these are attended to. None is
             all. See `attention_fused.padded_length`.
-        rotation: turns queries and keys by their tokens' angles.
+        rotation: rotates queries and keys by the angles of their tokens.
         update: what an adapter adds to the outputs of the projections.
 
     Returns:
-        The tokens' updates. Scores and softmax are float32 for every type of `x`.
+        The updates of the tokens. Scores and softmax are float32 at least, for every type of `x`.
     """
     tokens = x.shape[-2]
     length = tokens if length is None else length
@@ -102,15 +102,15 @@ def attention(
 
 
 def split_heads(x: Float[Array, "*batch dim"], heads: int) -> Float[Array, "*batch head _"]:
-    """Cut the numbers of each token into heads, side by side."""
+    """Split the dimensions of each token into heads, side by side."""
     return x.reshape(*x.shape[:-1], heads, x.shape[-1] // heads)
 
 
 def rotate(x: Heads, rotation: Rotation, *, length: int | None = None) -> Heads:
-    """Turn queries or keys by their tokens' angles (RoPE: Su et al. 2021), in float32.
+    """Rotate queries or keys by the angles of their tokens (RoPE: Su et al. 2021), in float32.
 
-    Numbers i and i + dim / 2 of a head are a pair. Tokens before those with angles stay as they
-    are, to the bit, and so does padding after the first `length`.
+    Dimensions i and i + dim / 2 of a head are a pair. Tokens before those with angles are returned
+    bit for bit, as is padding after the first `length` tokens.
     """
     wide = at_least_float32(x)
     length = x.shape[-3] if length is None else length
@@ -130,9 +130,9 @@ def cross_attention(
     x: Float[Array, "*batch token dim"],
     heads: int,
 ) -> Float[Array, "*batch query dim"]:
-    """Attend from queries, of each sequence or shared by a whole batch, to the tokens of `x`.
+    """Attend from queries, one set per sequence or one for the batch, to the tokens of `x`.
 
-    Scores, softmax and parameters are those of `attention`.
+    Scores, softmax and parameters are as in `attention`.
     """
     *batch, _, dim = x.shape
     asked = split_heads(linear(columns(params.qkv, 0, dim), queries), heads)
@@ -150,9 +150,9 @@ def first_token_attention(
     rotation: Rotation | None = None,
     update: LinearUpdate = no_update,
 ) -> Float[Array, "*batch head token"]:
-    """Compute how much of each token the first token's `attention` takes, in float32 at least.
+    """Compute the first token's weights in `attention`, over all tokens, in float32 at least.
 
-    A head's shares sum to 1. `rotation` turns keys; the first token has no angle.
+    The weights of a head sum to 1. `rotation` rotates keys; the first token has no angle.
     """
     dim = x.shape[-1]
     query = part_of_qkv(params, 0, x[..., :1, :], update)[..., 0, :] / math.sqrt(dim // heads)
@@ -173,7 +173,7 @@ def attention_weights(
     rotation: Rotation | None = None,
     update: LinearUpdate = no_update,
 ) -> Float[Array, "*batch head token token"]:
-    """Compute how much of each token every token's `attention` takes, in float32 at least.
+    """Compute the weights of `attention`, of every token for every token, in float32 at least.
 
     Rows sum to 1. `mask[i, j]` allows token i to attend to token j.
     """
@@ -191,29 +191,29 @@ def part_of_qkv(
     x: Float[Array, "*batch token dim"],
     update: LinearUpdate = no_update,
 ) -> Float[Array, "*batch token dim"]:
-    """Compute queries (0), keys (1) or values (2) alone, with heads side by side."""
+    """Compute only queries (0), keys (1) or values (2), with heads side by side."""
     here = slice(number * x.shape[-1], (number + 1) * x.shape[-1])
     y, extra = linear(columns(params.qkv, here.start, here.stop), x), update("qkv", x)
     return y if extra is None else y + extra[..., here]
 
 
 class _Axes(NamedTuple):
-    """The axes of queries i, keys j, heads h and a head's numbers d, as `jnp.einsum` names them."""
+    """Axes for `jnp.einsum`: i for queries, j for keys, h for heads, d for dimensions of a head."""
 
     queries: str
     keys: str
     scores: str
 
 
-# Every product is a plain batched one in the order of memory, which the CPU's libraries take.
+# Every product is a plain batched one in memory order, which the CPU's libraries support.
 _HEADS_FIRST = _Axes("h...id", "h...jd", "h...ij")
-# As the linear layer leaves them: an accelerator's compiler has no use for the copies.
+# As the linear layer leaves them: an accelerator's compiler gains nothing from copies.
 _HEADS_LAST = _Axes("...ihd", "...jhd", "...hij")
 
 
 _SCORES = 2**20
-"""Attention scores that a CPU computes at once: more don't stay in its cache. Images of 518 x 518
-are described 1.5 to 2.2 times as fast, batches of 224 x 224 0.94 to 1.22 times
+"""Attention scores that a CPU computes at once: more don't stay in its cache. With this
+limit, images of 518 x 518 are 1.5 to 2.2 times as fast, batches of 224 x 224 0.94 to 1.22 times
 (docs/performance-studies.md, Growth)."""
 
 
@@ -225,17 +225,17 @@ def dot_product_attention(
     mask: Bool[Array, "query key"] | None = None,
     dropout_mask: Float[Array, "*#batch head key query"] | None = None,
 ) -> Float[Array, "*batch query head dim"]:
-    """Average the values for every query, weighted by its scores' softmax times the dropout mask.
+    """Average the values for each query, weighted by softmax(scores) times the dropout mask.
 
-    The gradient is a custom rule. JAX's own would recompute the result, and order products such
-    that they take twice as long on a CPU. There is no forward mode (`jax.jvp`).
+    The gradient is a custom rule. JAX's own would recompute the result, and order the products so
+    that they take twice as long on a CPU. Forward mode (`jax.jvp`) is not supported.
 
     Args:
-        queries: not yet divided by the root of their width.
-        keys: of the tokens that queries attend to.
-        values: of the same tokens.
+        queries: not yet divided by the square root of their width.
+        keys: keys of the tokens that queries attend to.
+        values: values of the same tokens.
         mask: `mask[i, j]` allows query i to attend to key j; a row must allow at least one.
-        dropout_mask: factors of the weights, 0 or above 1.
+        dropout_mask: factors that multiply the weights, 0 or above 1.
     """
     queries = queries / math.sqrt(queries.shape[-1])
     dropped = None if dropout_mask is None else dropout_mask.swapaxes(-2, -1)
@@ -262,7 +262,7 @@ def _mix_values(
     axes: _Axes,
     precision: str | None,
 ) -> Float[Array, "..."]:
-    """Compute `dot_product_attention` of arrays with `axes`; on a CPU some scores at a time."""
+    """Compute `dot_product_attention` of arrays with `axes`; on a CPU, some scores at a time."""
 
     def mix(queries: Array, keys: Array, values: Array, dropped: Array | None) -> Array:
         weights, totals = _softmax(queries, keys, mask, axes, precision)
@@ -280,7 +280,7 @@ def _mix_values(
     def mix_head(*parts: Array | None) -> Array:
         return mix(*jax.tree.map(lambda part: part[None], parts))[0]
 
-    # A batch may be spread over devices and stays whole: a head's queries are cut instead.
+    # A batch may be sharded over devices, so the queries of a head are split instead.
     cut = min(queries.shape[-2], -(-of_device // (len(queries) * _SCORES)))
     if cut == 1 or mask is not None or dropout_mask is not None:
         parts = queries, keys, values, dropout_mask

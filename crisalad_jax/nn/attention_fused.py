@@ -1,6 +1,6 @@
-"""Self-attention that is fused on accelerators, so that scores never reach the memory.
+"""Fused self-attention on accelerators, which never writes scores to memory.
 
-It is cuDNN's on a GPU in bfloat16, and that of `attention_pallas` on a TPU.
+It uses cuDNN on a GPU in bfloat16, and `attention_pallas` on a TPU.
 """
 
 from typing import Any
@@ -13,15 +13,15 @@ from crisalad_jax.nn.products import rule_precision
 from crisalad_jax.utils.target import target, traced_mesh
 
 _EIGHT = 8
-"""Number that fused attention takes multiples of, of tokens and of a head's numbers. For training
-cuDNN needs even numbers of tokens, and eights keep every row aligned. On a TPU sequences of eights
-are rows of one matrix as they are; others are copied on the way to each product and back."""
+"""Tokens, and dimensions of a head, come in multiples of this for fused attention. cuDNN needs even
+numbers of tokens for training, and multiples of 8 keep every row aligned. On a TPU such sequences
+already are rows of one matrix; others are copied before and after each product."""
 _CUDNN_HEAD = 128
-"""Widest head that cuDNN's attention takes on every GPU that has it."""
+"""Widest head that cuDNN's attention supports on every GPU that has it."""
 
 
 def padded_length(tokens: int, dtype: Any, dim: int, heads: int) -> int:
-    """Return the number of tokens to pad a sequence to, so that no `attention` has to do it.
+    """Return the length to pad a sequence to, so that no call of `attention` has to pad it.
 
     Example:
         >>> from crisalad_jax.utils.target import CPU, lowering_for
@@ -37,14 +37,14 @@ def padded_length(tokens: int, dtype: Any, dim: int, heads: int) -> int:
 def attend(
     qkv: Float[Array, "*batch token three_heads dim"], length: int
 ) -> Float[Array, "*batch token head dim"] | None:
-    """Average the values for every query, weighted by its scores' softmax.
+    """Average the values for each query, weighted by the softmax of its scores.
 
     Args:
-        qkv: the heads of queries, of keys and of values.
-        length: number of first tokens that are not padding, to which alone tokens attend.
+        qkv: the heads of the queries, then of the keys, then of the values.
+        length: number of leading tokens that are not padding; only these are attended to.
 
     Returns:
-        The averages; None where no kernel takes such tokens.
+        The averages; None if no kernel supports such tokens.
     """
     *batch, tokens, three_heads, width = qkv.shape
     heads = three_heads // 3
@@ -52,7 +52,7 @@ def attend(
     if _takes_cudnn(qkv.dtype, width):
         mixed = _cudnn(sequences, length)
     elif _takes_pallas(tokens, qkv.dtype, heads * width, heads):
-        from crisalad_jax.nn import attention_pallas  # Pallas takes long to import
+        from crisalad_jax.nn import attention_pallas  # Pallas is slow to import
 
         mesh = traced_mesh()
         if mesh is None or sequences.shape[0] % mesh.size:
@@ -84,7 +84,7 @@ def _cudnn(
     count, tokens, *_ = qkv.shape
     more = -tokens % _EIGHT
     qkv = jnp.pad(qkv, ((0, 0), (0, more), (0, 0), (0, 0)))
-    # Queries of padding attend as others do, which keeps their numbers finite.
+    # Queries of padding attend like all others, which keeps their values finite.
     lengths = None if length == tokens + more else jnp.full(count, length, jnp.int32)
     mixed = jax.nn.dot_product_attention(
         *jnp.split(qkv, 3, axis=-2), key_value_seq_lengths=lengths, implementation="cudnn"

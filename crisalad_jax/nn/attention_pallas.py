@@ -2,9 +2,9 @@
 
 The kernels read queries, keys and values where the linear layer left them, side by side, and write
 the heads side by side. XLA's own attention would copy all of these, with the heads in front, and
-pad an odd number of tokens by half. Scores never leave the chip: the backward kernel computes them
-again, and keeps nothing but its inputs. Written from Vaswani et al. 2017 and the idea of Dao et al.
-2022, without their online softmax: all keys of an image fit the chip.
+pad an odd number of tokens by half. Scores never leave the chip: the backward kernel recomputes
+them from its inputs, and nothing else is stored. Written from Vaswani et al. 2017 and the idea of
+Dao et al. 2022, without their online softmax: all keys of an image fit on the chip.
 """
 
 import functools
@@ -20,17 +20,17 @@ from jax.sharding import AbstractMesh, Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 _LANES = 128
-"""Numbers in a row of a vector register: heads are read so many numbers at a time."""
+"""Values in a row of a vector register: heads are read that many values at a time."""
 _WIDTH = 512
-"""Most numbers of all heads that a step of a kernel reads of each token: fewer steps wait less."""
+"""Most values of each token, over all heads, that a kernel step reads: fewer steps wait less."""
 _PIECES = 12
-"""Most products of scores that a step is written out for, or compiling takes minutes; one unit of
-lanes is the least."""
+"""Most score products that a step is unrolled into: more take minutes to compile. A step has at
+least one unit of lanes."""
 _ROWS = 384
 """Most queries whose scores are computed at a time."""
 _TOKENS = {jnp.dtype(jnp.bfloat16): 2048, jnp.dtype(jnp.float32): 640}
-"""Most tokens by type: their scores for `_ROWS` queries are 3 MiB. In float32 the compiler takes
-minutes for more."""
+"""Most tokens by type: their scores for `_ROWS` queries are 3 MiB. In float32, more tokens take
+minutes to compile."""
 _MEMORY = 2**26
 """Bytes of a chip's vector memory that a kernel may use: half of the smallest chip's since v5e."""
 
@@ -38,7 +38,7 @@ Kernel = Callable[..., None]
 
 
 def fits(tokens: int, dim: int, heads: int, dtype: Any) -> bool:
-    """Return whether the kernels take `heads` heads of all `dim` numbers in this type."""
+    """Return whether the kernels support sequences of this length, width, head count and type."""
     head = dim // heads
     whole = (_LANES % head == 0 or head % _LANES == 0) and dim % max(_LANES, head) == 0
     return head >= 32 and whole and tokens <= _TOKENS.get(jnp.dtype(dtype), 0)
@@ -51,18 +51,18 @@ def attend(
     precision: str | None,
     mesh: Mesh | AbstractMesh,
 ) -> Float[Array, "batch token dim"]:
-    """Average the values of each sequence for every query, weighted by its scores' softmax.
+    """Average the values of each sequence for each query, weighted by the softmax of its scores.
 
     Args:
         qkv: queries, keys and values side by side, each with the heads side by side.
         heads: number of heads; see `fits`.
-        length: number of first tokens that are no padding, to which alone tokens attend.
-        precision: that of float32 products. None is "default", one pass. The compiler of kernels
-            knows no "high" and takes "highest".
-        mesh: devices that the batch is sharded over, as `traced_mesh` tells.
+        length: number of leading tokens that are not padding; only these are attended to.
+        precision: precision of float32 products. None is "default", one pass. The kernel compiler
+            does not support "high", so "highest" replaces it.
+        mesh: devices that the batch is sharded over, from `traced_mesh`.
 
     Returns:
-        The heads side by side.
+        The averages, with the heads side by side.
     """
 
     run = functools.partial(_call, heads=heads, length=length, precision=precision)
@@ -85,11 +85,11 @@ def attend(
 
 
 def _over_batches(call: Callable[..., Array], mesh: Mesh | AbstractMesh) -> Callable[..., Array]:
-    """Compute sequences on the devices that they are sharded over."""
+    """Compute each sequence on the device that holds it."""
     if mesh.size == 1:
         return call
     over = PartitionSpec(mesh.axis_names)
-    # Kernels do not say over which devices their results vary, which the check would need.
+    # Kernels don't declare over which devices their results vary, which the check would need.
     return jax.shard_map(call, mesh=mesh, in_specs=over, out_specs=over, check_vma=False)
 
 
@@ -109,7 +109,7 @@ def _call(
     head = dim // heads
     unit = max(_LANES, head)
     pieces = unit // head * -(-tokens // _ROWS)
-    # A product in float32 is six of bfloat16.
+    # A float32 product is six bfloat16 products.
     most = min(_WIDTH // unit, _PIECES // pieces) if qkv.dtype == jnp.bfloat16 else 1
     width = unit * max(n for n in range(1, max(1, most) + 1) if dim // unit % n == 0)
     steps = dim // width
@@ -204,7 +204,7 @@ def _heads(block: Any, head: int) -> Iterator[slice]:
 
 
 def _chunks(block: Any) -> Iterator[slice]:
-    """Cut tokens into equal parts of at most `_ROWS`, at multiples of a register's 16 rows."""
+    """Split tokens into equal parts of at most `_ROWS`, at multiples of a register's 16 rows."""
     tokens = block.shape[1]
     size = -(-tokens // (16 * -(-tokens // _ROWS))) * 16
     return (slice(start, min(start + size, tokens)) for start in range(0, tokens, size))

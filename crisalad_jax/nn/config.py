@@ -1,4 +1,4 @@
-"""The configuration of a whole model, and the presets of model sizes."""
+"""The configuration of a model, and presets for model sizes."""
 
 import dataclasses
 import math
@@ -17,16 +17,16 @@ from crisalad_jax.nn.cross_image import CROSS_IMAGE, CrossImage, CrossImageConfi
 from crisalad_jax.nn.projection import ProjectionConfig
 
 MOST_PIXELS = 4096
-"""Largest side of an image that models describe: attention grows by its fourth power."""
+"""Largest side of an image that models accept: attention grows with its fourth power."""
 
 
 @short_repr("backbone", "aggregator")
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """The configuration of CriSALAD, and of the methods that it is compared with.
+    """The configuration of CriSALAD and of the methods that it is compared with.
 
     DINO-SALAD has no adapter and no encoder. CricaVPR has the multi-resolution adapter and the GeM
-    pyramid. DINOv2 by itself gives its class token. See docs/methods.md for all methods.
+    pyramid. Bare DINOv2 uses its class token. See docs/methods.md for all methods.
 
     Example:
         >>> model = ModelConfig(aggregator="gem", cross_image="none")
@@ -46,21 +46,21 @@ class ModelConfig:
     cross_image: OrName[CrossImage] = part_field(CROSS_IMAGE, "transformer")
     """Registered encoder, or its name; it relates the images of a batch."""
     projection: ProjectionConfig = ProjectionConfig()
-    """Linear layer over the whole descriptor; by default none."""
+    """Linear layer over the descriptor; by default none."""
     compute_dtype: Literal["float32", "bfloat16", "float64"] = non_semantic_field("float32")
     """Type of the matrix products; normalisations, softmax and transport are float32 at least.
     float64 is for numerical studies, under JAX's 64-bit mode."""
     precision: Literal["highest", "high", "default"] = non_semantic_field("highest")
-    """Precision of float32 products on accelerators, in JAX's words: "highest" is float32, "high"
-    fewer bits, and "default" what the platform computes fastest (docs/performance.md). A CPU
+    """Precision of float32 products on accelerators, as JAX names it: "highest" is float32,
+    "high" fewer bits, and "default" the platform's fastest (docs/performance.md). A CPU
     computes in float32. Products of another `compute_dtype` are in that type."""
     remat: Literal["dots", "full", "none"] = non_semantic_field("dots")
     """Rematerialisation of a block in the backward pass. "dots" stores the results of large matrix
-    products, "full" the block's input alone (least memory, one more forward pass), and "none"
+    products, "full" only the block's input (least memory, one more forward pass), and "none"
     everything. Results are the same."""
 
     def __post_init__(self) -> None:
-        """Check that the parts fit each other."""
+        """Check that the parts are compatible."""
         resolve_names(self)
         request = self.aggregator.features(self.backbone.depth)
         backbone, aggregator = self.backbone, f"aggregator {self.aggregator.part_name}"
@@ -124,7 +124,7 @@ class ModelConfig:
 
     @property
     def unit_length(self) -> bool:
-        """Whether descriptors are unit vectors, as the projection or the encoder leaves them."""
+        """Whether descriptors are unit vectors, which the projection or the encoder decides."""
         alone = not self.cross_image.attends or self.cross_image.width is None
         return self.projection.renormalise if self.projection.dim else alone
 
@@ -146,10 +146,10 @@ class ModelConfig:
 
     @property
     def input_size(self) -> Size:
-        """Height and width of the network's input: `image_size`, rounded where that is asked for.
+        """Height and width of the network's input: `image_size`, rounded if `preprocessing` does.
 
-        Training, an export and costs are of this size, whatever `PreprocessingConfig.size_rule`. Of
-        local features it is that of their bytes.
+        Training, exports and costs use this size, whatever `PreprocessingConfig.size_rule` is. For
+        local features, it is the height and width of their bytes.
         """
         return self.backbone.encoded_size or self.rounded_size(self.image_size)
 
@@ -159,12 +159,12 @@ class ModelConfig:
 
     @property
     def side_multiple(self) -> int:
-        """Number of pixels that sides are multiples of: 1 where the backbone takes any size."""
+        """Number of pixels that sides are multiples of: 1 if the backbone takes any size."""
         return 1 if self.backbone.any_size else self.backbone.patch_size
 
     @property
     def images_in_words(self) -> str:
-        """The size and filter of images, in a few words.
+        """The size and resize filter of images, as a short text.
 
         Example:
             >>> PRESETS["b14"].images_in_words
@@ -177,10 +177,10 @@ class ModelConfig:
         return f"{words}, rounded to multiples of {multiple}" if rounded else words
 
     def check_image_size(self, image_size: tuple[int, int]) -> None:
-        """Check that this model can describe images of this height and width.
+        """Check that this model accepts images of this height and width.
 
         Raises:
-            InputError: a side is above `MOST_PIXELS` or no multiple of the patch size, there are
+            InputError: a side is above `MOST_PIXELS` or not a multiple of the patch size, there are
                 too few patches for the aggregator, or its parameters are for another size.
         """
         found = " x ".join(map(str, image_size))
@@ -197,18 +197,18 @@ class ModelConfig:
         self.aggregator.check_grid(self.backbone.grid(image_size), self.backbone.patch_size)
 
     def resized(self, image_size: Size | None, resize: Sequence[str] = ()) -> "ModelConfig":
-        """Return this model for images of another size, or resized in another way.
+        """Return this model with another image size, or another way to resize images.
 
         Args:
             image_size: height and width in pixels; None keeps the model's own.
-            resize: some of `preprocessing.WORDS`, such as "bicubic"; none keep the model's own.
+            resize: values of `preprocessing.WORDS`, such as "bicubic"; none keep the model's own.
 
         Returns:
-            The configuration, which fits the same parameters.
+            The configuration, for the same parameters.
 
         Raises:
-            InputError: what `check_image_size` and `PreprocessingConfig.changed_by` raise; a size
-                for a model that takes images at their own.
+            InputError: as `check_image_size` and `PreprocessingConfig.changed_by`; or a size is
+                given for a model that takes images at their own size.
 
         Example:
             >>> PRESETS["tiny"].resized((70, 98)).grid
@@ -218,7 +218,7 @@ class ModelConfig:
         config = dataclasses.replace(self, preprocessing=changed) if resize else self
         if image_size is None:
             return config
-        # Beside the word native a size is on purpose: training and exports are of it.
+        # With "native" in `resize`, a size is deliberate: training and exports use it.
         require(
             changed.size_rule != "native" or "native" in resize,
             f"--image-size: found {' x '.join(map(str, image_size))} for a model that takes images "
@@ -246,11 +246,11 @@ PRESETS: Mapping[str, ModelConfig] = {
     "l14": _preset(1024, 24, 16),
     "g14": _preset(1536, 40, 24, ffn="swiglu"),
 }
-"""Sizes of models by name."""
+"""Model sizes by name."""
 
 
 def check_unit_length(model: ModelConfig, name: str) -> None:
-    """Check that a model makes unit vectors, which are compared by cosine.
+    """Check that a model outputs unit vectors, which are compared by cosine.
 
     Raises:
         InputError: it does not; the message begins with `name`.
@@ -263,12 +263,12 @@ def check_unit_length(model: ModelConfig, name: str) -> None:
 
 
 def with_aggregator(model: ModelConfig, name: str, preset: str, **changes: Any) -> ModelConfig:
-    """Return a model with the aggregator of this name, in the size of the preset.
+    """Return a model with the aggregator of this name, at the size of the preset.
 
     Args:
         model: the model.
         name: a registered aggregator.
-        preset: whose size the aggregator takes, as `PRESETS` names them.
+        preset: name in `PRESETS` of the size that the aggregator takes.
         **changes: other fields of the model.
 
     Returns:

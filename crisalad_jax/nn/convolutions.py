@@ -1,4 +1,4 @@
-"""What convolutional backbones are made of: convolutions with a batch norm, and maxima."""
+"""Layers of convolutional backbones: convolutions with batch norm, and max pooling."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 Map = Float[Array, "image _ _ _"]
 """Features in rows and columns, channels last."""
 BATCH_NORM_EPSILON = 1e-5
-"""Epsilon of torch's `nn.BatchNorm2d`, which all published backbones keep."""
+"""Epsilon of torch's `nn.BatchNorm2d`, which all published backbones use."""
 
 
 @pytree_dataclass
@@ -30,9 +30,9 @@ class ConvNorm:
 def init_he_conv(
     key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int, *, bias: bool = False
 ) -> Conv:
-    """Draw a convolution as torchvision: normal of variance 2 / (kernel_size^2 d_out), bias 0.
+    """Draw a convolution like torchvision: normal of variance 2 / (kernel_size^2 d_out), bias 0.
 
-    This is He et al.'s start (2015), by the number of outputs.
+    This is the initialisation of He et al. (2015), in its fan-out mode.
     """
     deviation = math.sqrt(2 / (kernel_size**2 * d_out))
     weight = random_init.normal(key, (kernel_size, kernel_size, d_in, d_out), scale=deviation)
@@ -42,7 +42,7 @@ def init_he_conv(
 def init_conv_norm(
     key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int, *, bias: bool = False
 ) -> ConvNorm:
-    """Draw a convolution, and start its batch norm as the identity."""
+    """Draw a convolution, with a batch norm that starts as the identity."""
     return ConvNorm(init_he_conv(key, kernel_size, d_in, d_out, bias=bias), init_batch_norm(d_out))
 
 
@@ -56,18 +56,18 @@ def conv_norm(
 ) -> tuple[Float[Array, "image rows columns d_out"], ConvNorm]:
     """Convolve, and normalise by the stored statistics or by those of a training batch.
 
-    The stored statistics are folded into the convolution: that costs a pass over the weights, and
+    The stored statistics are folded into the convolution, which costs a pass over the weights but
     saves one over the much larger activations.
 
     Args:
         params: the layers.
         x: a batch of images.
-        valid: which images the batch's statistics are taken of; None takes the stored ones.
-        stride: of the convolution.
+        valid: images that the batch's statistics are taken from; None uses the stored ones.
+        stride: stride of the convolution.
         epsilon: added to the variance.
 
     Returns:
-        (y, updated): the second has updated running statistics where `valid` is given.
+        (y, updated): `updated` has updated running statistics if `valid` is given.
     """
     if valid is not None:
         y = conv(params.conv, x, stride=stride)
@@ -84,9 +84,9 @@ def conv_norm(
 def max_pool(
     x: Float[Array, "*batch height width dim"], size: int, *, stride: int = 2, padding: int = 0
 ) -> Float[Array, "*batch rows columns dim"]:
-    """Return the maximum of each window of size x size pixels; padding never wins.
+    """Return the maximum of each window of size x size pixels, ignoring padding.
 
-    The gradient goes to the first of equal pixels, as torch's does; forward mode has none.
+    The gradient goes to the first of equal pixels, as in torch. Forward mode is not supported.
     """
     images = x.reshape(-1, *x.shape[-3:])
     y = _max_pool(images, size, stride, padding)
@@ -96,8 +96,8 @@ def max_pool(
 def _pool(x: Array, size: int, stride: int, padding: int) -> Array:
     """Pool a batch.
 
-    The gradient is told to JAX because its own keeps all pixels, and on a CPU takes longer: it
-    scatters each window's change to its maximum.
+    The gradient is a custom rule, because JAX's own stores all pixels and is slower on a CPU: it
+    scatters each window's gradient to its maximum.
     """
     margins = ((0, 0), (padding, padding), (padding, padding), (0, 0))
     window, strides = (1, size, size, 1), (1, stride, stride, 1)
@@ -108,7 +108,7 @@ _max_pool = jax.custom_vjp(_pool, nondiff_argnums=(1, 2, 3))
 
 
 def _max_pool_forward(x: Array, size: int, stride: int, padding: int) -> tuple[Array, Any]:
-    """Keep which pixel of each window was its first maximum, and the images' height and width."""
+    """Save which pixel of each window was its first maximum, and the images' height and width."""
     y = _pool(x, size, stride, padding)
     rows, columns = y.shape[1:3]
     margin = (padding, padding)
@@ -125,7 +125,7 @@ def _max_pool_forward(x: Array, size: int, stride: int, padding: int) -> tuple[A
 def _max_pool_backward(
     size: int, stride: int, padding: int, kept: tuple[Array, tuple[int, int]], change: Array
 ) -> tuple[Array]:
-    """Put every window's gradient where its maximum was; windows overlap, and add up."""
+    """Add the gradient of every window at its maximum; windows may overlap."""
     winner, (height, width) = kept
     zero = jnp.zeros((), change.dtype)
     total: Any = 0

@@ -26,7 +26,7 @@ _SCOPES = {
     "blocks": "backbone blocks",
     "backbone": "backbone embedding, norm",
 }
-"""Part by scope in the names of a program and of parameters, the innermost scope first."""
+"""Model part by scope, in the names of programs and parameters; innermost scopes come first."""
 
 
 _NAMES = re.compile(r"\w+")
@@ -46,7 +46,7 @@ class PartCost(NamedTuple):
 def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     """Count the parameters of each part, and its multiply-accumulates per image.
 
-    Work that a batch does once, independent of its images, does not count.
+    Work that is done once per batch, independent of its images, is not counted.
 
     Args:
         config: the model; images are of its `input_size`.
@@ -62,7 +62,7 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
         'cross-image encoder'
     """
     params = parameter_shapes(config)
-    config = dataclasses.replace(config, compute_dtype="float32")  # counts are of any type
+    config = dataclasses.replace(config, compute_dtype="float32")  # counts hold for any type
 
     extract = functools.partial(extract_tokens, config=config)
 
@@ -85,22 +85,22 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
 
 
 def _part_of(text: str) -> str:
-    """Return the part that a parameter's name or a program's scope is of; none is empty."""
+    """Return the model part of a parameter's name or a program's scope; empty if there is none."""
     names = _NAMES.findall(text)
     return next((part for scope, part in _SCOPES.items() if scope in names), "")
 
 
-@lowering_for(PORTABLE)  # whose products are all seen: a fused attention is one operation
+@lowering_for(PORTABLE)  # where all products are visible: fused attention is one operation
 def count_macs(function: Any, *arguments: Any) -> "collections.Counter[str]":
     """Count the multiply-accumulates of a function's program, in products and convolutions.
 
     Args:
-        function: of arrays.
+        function: a function of arrays.
         arguments: arrays, or their shapes.
 
     Returns:
-        The counts of each part of a model, and of all else under an empty name. Of the branches of
-        a conditional, the cheapest counts.
+        The counts of each part of a model, and of everything else under an empty name. Only the
+        cheapest branch of a conditional counts.
 
     Example:
         >>> import jax.numpy as jnp
@@ -117,7 +117,7 @@ def _count(program: Any, scope: str = "", times: int = 1) -> "collections.Counte
         here = f"{scope}/{equation.source_info.name_stack}"
         name = equation.primitive.name
         inside = times * equation.params["length"] if name == "scan" else times
-        # Programs are among the parameters, closed or not, and branches are a tuple of them.
+        # Inner programs are among the parameters, closed or not; branches are a tuple of them.
         inner = [getattr(value, "jaxpr", value) for value in jax.tree.leaves(equation.params)]
         inner = [_count(each, here, inside) for each in inner if isinstance(each, core.Jaxpr)]
         if name == "cond":
@@ -159,13 +159,13 @@ def adapter_macs(config: ModelConfig) -> int:
 
 
 def paper_adapter_macs(config: ModelConfig, macs: int) -> int:
-    """Count an adapter's multiply-accumulates as the paper (Table 3: 39.223 M), each linear once.
+    """Count an adapter's multiply-accumulates as the paper does (Table 3: 39.223 M).
 
-    Its linears are the layers called `down` and `up`; the paper's others are convolutions.
+    Its linear layers, `down` and `up`, count once each; the paper's other layers are convolutions.
 
     Args:
         config: the model.
-        macs: those of `adapter_macs`, which counts a linear layer at every token instead.
+        macs: from `adapter_macs`, which counts a linear layer at every token instead.
     """
     backbone: Any = config.backbone
     weights = named_leaves(parameter_shapes(config).backbone.blocks.adapter).items()

@@ -1,6 +1,6 @@
 """Cross-image encoders, which relate the images of a batch: the paper's (section 3.4), and others.
 
-Layers of the paper's are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact
+The paper's layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact
 GELU.
 """
 
@@ -57,17 +57,17 @@ class CrossImage(Part, abc.ABC):
 
     attends: ClassVar[bool] = True
     """Whether a descriptor depends on the other images of its batch."""
-    global_token = True  # without a type, so that a class may make it a field
-    """Whether the global token takes part, cut into tokens of the local ones' width."""
-    width = None  # without a type, as well
-    """Width of the tokens that it cuts the finished unit descriptor into, of which it makes the
-    descriptor: no normalisation follows. None takes the aggregator's tokens."""
+    global_token = True  # untyped, so that a subclass may make it a field
+    """Whether the global token takes part, cut into tokens as wide as the local ones."""
+    width = None  # untyped too
+    """Width of the tokens that the unit descriptor is cut into; the encoder's output is then the
+    descriptor, not normalised. None takes the aggregator's tokens."""
 
     def check(self, dim: int) -> None:
-        """Raise InputError where it does not fit tokens of this width; by default never."""
+        """Raise InputError if tokens of this width are not supported; by default never."""
 
     def numbers(self, params: Any) -> Mapping[str, Any]:
-        """Return numbers of the parameters that validations log by name; by default none."""
+        """Return values of the parameters that validations log, by name; by default none."""
         return {}
 
     @abc.abstractmethod
@@ -76,27 +76,27 @@ class CrossImage(Part, abc.ABC):
 
     @abc.abstractmethod
     def apply(self, params: Any, tokens: Sequences, *, mask: Mask, key: Keys) -> Sequences:
-        """Return the images' tokens, in the shape and type in which they come.
+        """Return the images' updated tokens, in the shape and type of the given ones.
 
         Args:
-            params: of `init`.
-            tokens: of every image, in the type to compute in.
+            params: from `init`.
+            tokens: tokens of every image, in the type to compute in.
             mask: which images attend to which, every image to at least one; None is all to all.
-            key: draws dropout; None means inference.
+            key: random key for dropout; None means inference.
         """
 
     def attention(
         self, params: Any, tokens: Sequences, *, mask: Mask
     ) -> Float[Array, "layer token head image image"]:
-        """Return how much of each image every image takes, for `cross_image_attention`.
+        """Return the attention weights between images, for `cross_image_attention`.
 
         Args:
-            params: of `init`.
-            tokens: as `apply` takes them.
-            mask: as `apply` takes it.
+            params: from `init`.
+            tokens: see `apply`.
+            mask: see `apply`.
 
         Raises:
-            InputError: it has no attention, as by default.
+            InputError: the encoder has no attention, which is the default.
         """
         raise InputError(f"cross_image: found {self.part_name}, expected one that has attention")
 
@@ -107,7 +107,7 @@ register_cross_image = CROSS_IMAGE.register
 
 @CROSS_IMAGE.register("none")
 class NoCrossImage(CrossImage):
-    """No encoder: a descriptor depends on no other image."""
+    """No encoder: a descriptor depends only on its own image."""
 
     attends: ClassVar[bool] = False
 
@@ -115,7 +115,7 @@ class NoCrossImage(CrossImage):
         """Return None: there are no parameters."""
 
     def apply(self, params: None, tokens: Sequences, *, mask: Mask, key: Keys) -> Sequences:
-        """Return the tokens."""
+        """Return the tokens unchanged."""
         return tokens
 
 
@@ -128,7 +128,7 @@ class CrossImageEncoder:
 
 @dataclasses.dataclass(frozen=True)
 class TransformerEncoder(CrossImage):
-    """Layers of torch's, each of which attends from a token to the same token of all images."""
+    """Torch's encoder layers, which attend from each token to the same token of all images."""
 
     layers: PositiveInt = 2
     """Number of layers."""
@@ -137,16 +137,16 @@ class TransformerEncoder(CrossImage):
     dropout: Fraction = non_semantic_field(0.1)
 
     def check(self, dim: int) -> None:
-        """Require heads that divide a token."""
+        """Require a number of heads that divides the width of a token."""
         words = f"a divisor of the {dim} numbers of a token"
         require_field(self, "heads", dim % self.heads == 0, words)
 
     def init(self, key: PRNGKeyArray, dim: int) -> Any:
         """Draw parameters as torch does: Glorot-uniform attention, zero biases, default linears.
 
-        All layers start equal, for torch's `nn.TransformerEncoder` copies the one that it is given.
+        All layers start equal, because torch's `nn.TransformerEncoder` copies the layer it gets.
         """
-        # Drawn anew: a training step that donates its buffers must not find one twice.
+        # Drawn separately: a training step that donates its buffers must not get one twice.
         layers = (init_encoder_layer(key, dim, self.feedforward) for _ in range(self.layers))
         return CrossImageEncoder(tuple(layers))
 
@@ -159,7 +159,7 @@ class TransformerEncoder(CrossImage):
     def attention(
         self, params: Any, tokens: Sequences, *, mask: Mask
     ) -> Float[Array, "layer token head image image"]:
-        """Return the weights of every layer's softmax."""
+        """Return the softmax weights of every layer."""
         weights = []
         for layer in params.layers:
             by_token = tokens.swapaxes(0, 1)
@@ -177,10 +177,10 @@ class TransformerEncoder(CrossImage):
     def _attend_across(self, params: Attention, x: Sequences, mask: Mask, key: Keys) -> Sequences:
         """Attend from each token to the same token of all images.
 
-        Where images are sharded, a device attends from its own to those of all: keys and values are
-        gathered once, and their gradient is scattered once. Left alone, XLA splits the keys and
-        adds up scores, totals and results, with twelve collectives a layer. Dropout has the same
-        bits as on one device.
+        If images are sharded, a device attends from its own images to those of all devices: keys
+        and values are gathered once, and their gradient is scattered once. By itself, XLA splits
+        the keys and adds up scores, totals and results, with twelve collectives per layer. Dropout
+        draws the same bits as on one device.
         """
         images, tokens, dim = x.shape
         mesh, heads = image_mesh(), self.heads
@@ -226,7 +226,7 @@ class CrossImageConfig(TransformerEncoder):
 class SageCrossImageConfig(TransformerEncoder):
     """SAGE's transformer encoder (ICLR 2026), over a finished descriptor cut into tokens.
 
-    Its descriptors are not unit vectors, and are compared by Euclidean distance. A loss takes them
+    Its descriptors are not unit vectors, and are compared by Euclidean distance. Losses take them
     normalised.
     """
 
@@ -237,7 +237,7 @@ class SageCrossImageConfig(TransformerEncoder):
 
 @pytree_dataclass
 class GatedEncoder:
-    """A gate, and what is behind it."""
+    """A gate, and the encoder behind it."""
 
     gate: Float[Array, ""]
     encoder: CrossImageEncoder
@@ -247,9 +247,9 @@ class GatedEncoder:
 class GatedCrossImageConfig(CrossImageConfig):
     """The paper's encoder behind a learnt gate: y = x + tanh(g) (f(x) - x).
 
-    x are an image's tokens, f is the encoder of "transformer", and the number g starts at 0. An
-    untrained encoder therefore leaves descriptors as they are (in bfloat16 up to rounding). The
-    gate is that of Flamingo's layers (Alayrac et al. 2022), here on what the encoder adds.
+    x are an image's tokens, f is the encoder of "transformer", and the scalar g starts at 0. An
+    untrained encoder therefore leaves descriptors unchanged (in bfloat16 up to rounding). The gate
+    is that of Flamingo's layers (Alayrac et al. 2022), here applied to what the encoder adds.
     """
 
     def init(self, key: PRNGKeyArray, dim: int) -> GatedEncoder:
@@ -257,7 +257,7 @@ class GatedCrossImageConfig(CrossImageConfig):
         return GatedEncoder(random_init.zeros(), super().init(key, dim))
 
     def apply(self, params: GatedEncoder, tokens: Sequences, *, mask: Mask, key: Keys) -> Sequences:
-        """Add what the encoder adds, times the gate's hyperbolic tangent."""
+        """Add the encoder's update, times the hyperbolic tangent of the gate."""
         attended = super().apply(params.encoder, tokens, mask=mask, key=key)
         before, after = at_least_float32(tokens), at_least_float32(attended)
         return (before + jnp.tanh(params.gate) * (after - before)).astype(tokens.dtype)
@@ -269,15 +269,15 @@ class GatedCrossImageConfig(CrossImageConfig):
     def attention(
         self, params: GatedEncoder, tokens: Sequences, *, mask: Mask
     ) -> Float[Array, "layer token head image image"]:
-        """Return the weights behind the gate."""
+        """Return the attention weights of the encoder behind the gate."""
         return super().attention(params.encoder, tokens, mask=mask)
 
 
 @jax.custom_vjp
 def _gathered(own: Array) -> Array:
-    """Gather a device's images with those of all; their gradients are summed in float32 at least.
+    """Gather the images of all devices; their gradients are summed in float32 at least.
 
-    JAX's own rule sums them in the type of `own`, eight bits of a bfloat16.
+    JAX's own rule sums them in the type of `own`: in bfloat16, with eight bits.
     """
     return jax.lax.all_gather(own, IMAGE, tiled=True)
 

@@ -12,12 +12,12 @@ def diff_trees(found: Any, expected: Any, dtypes: Collection[Any] = ()) -> list[
     """List how a tree of arrays differs from another: names, shapes and types.
 
     Args:
-        found: the tree; its leaves may be of JAX or NumPy, traced, or only shapes.
+        found: the tree; its leaves may be JAX or NumPy arrays, traced, or only shapes.
         expected: a tree of arrays or shapes.
-        dtypes: types that a leaf may have in the place of its own.
+        dtypes: types that a leaf may have instead of the expected one.
 
     Returns:
-        A text for each difference; none where the trees fit.
+        A text for each difference; none if the trees match.
 
     Example:
         >>> import numpy as np

@@ -1,4 +1,4 @@
-"""The small layers: linear, layer norm, convolutions on a patch grid, GELU, dropout, L2."""
+"""Small layers: linear, layer norm, convolutions on a patch grid, GELU, dropout, L2."""
 
 import dataclasses
 import functools
@@ -15,12 +15,11 @@ from crisalad_jax.nn.products import convolve, matmul
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 Keys = Key[Array, "*keys"] | None
-"""One random key for all, or one for each entry of a batch; None is inference."""
+"""One random key for all, or one for each entry of a batch; None means inference."""
 Grid = tuple[int, int]
 """Rows and columns of patches."""
 Valid = Bool[Array, " image"] | None
-"""Images of a training batch whose statistics batch norms normalise by; None takes the stored ones.
-"""
+"""Images whose statistics batch norms normalise by in training; None uses the stored ones."""
 TAPS = "taps"
 """Scope of elementwise products that are the multiply-accumulates of a convolution."""
 STATISTICS = ("running_mean", "running_var")
@@ -73,7 +72,7 @@ class Conv:
 class BatchNorm:
     """Gain and shift of a batch norm, and the running statistics of the batches it has seen.
 
-    No gradient changes the statistics. `train_batch_norm` returns updated ones.
+    Gradients do not change the statistics; `train_batch_norm` returns updated ones.
     """
 
     weight: Float[Array, "*stack dim"]
@@ -83,14 +82,14 @@ class BatchNorm:
 
 
 def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
-    """Draw a linear layer as torch's `nn.Linear`: uniform within 1 / sqrt(d_in)."""
+    """Draw a linear layer like torch's `nn.Linear`: uniform within 1 / sqrt(d_in)."""
     return Linear(*_within(key, (d_in, d_out), fan=d_in, bias=bias))
 
 
 def _within(
     key: PRNGKeyArray, shape: tuple[int, ...], *, fan: int, bias: bool = True
 ) -> tuple[Float[Array, "*shape"], Float[Array, " d_out"] | None]:
-    """Draw weight and bias uniformly within 1 / sqrt(fan), as torch's layers start."""
+    """Draw weight and bias uniformly within 1 / sqrt(fan), like torch's layers."""
     weight_key, bias_key = random_init.split(key)
     bound = 1 / math.sqrt(fan)
     draw = functools.partial(random_init.uniform, minval=-bound, maxval=bound)
@@ -98,7 +97,7 @@ def _within(
 
 
 def init_small_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
-    """Draw a linear layer as vision transformers': normal of deviation 0.02, cut at two; bias 0."""
+    """Draw a linear layer of ViTs: normal of deviation 0.02, truncated at twice that; bias 0."""
     weight = random_init.truncated_normal(key, -2.0, 2.0, (d_in, d_out), scale=0.02)
     return Linear(weight, random_init.zeros(d_out) if bias else None)
 
@@ -111,25 +110,25 @@ def init_layer_norm(dim: int) -> LayerNorm:
 def init_depthwise_conv(
     key: PRNGKeyArray, kernel_size: int, dim: int, *, bias: bool = True
 ) -> DepthwiseConv:
-    """Draw depthwise filters as torch's `nn.Conv2d(groups=dim)`: uniform within 1 / kernel_size."""
+    """Draw filters like torch's `nn.Conv2d(groups=dim)`: uniform within 1 / kernel_size."""
     shape = kernel_size, kernel_size, dim
     return DepthwiseConv(*_within(key, shape, fan=kernel_size**2, bias=bias))
 
 
 def init_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
-    """Draw a convolution as torch's `nn.Conv2d`: uniform within 1 / sqrt(kernel_size^2 d_in)."""
+    """Draw a convolution like torch's `nn.Conv2d`: uniform within 1 / sqrt(kernel_size^2 d_in)."""
     shape = kernel_size, kernel_size, d_in, d_out
     return Conv(*_within(key, shape, fan=kernel_size**2 * d_in))
 
 
 def init_transposed_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
-    """Draw as torch's `nn.ConvTranspose2d`, which takes the channels out for those in."""
+    """Draw like torch's `nn.ConvTranspose2d`, whose fan-in counts the output channels."""
     shape = kernel_size, kernel_size, d_in, d_out
     return Conv(*_within(key, shape, fan=kernel_size**2 * d_out))
 
 
 def init_batch_norm(dim: int) -> BatchNorm:
-    """Make a batch norm as torch's `nn.BatchNorm2d`: mean 0 and variance 1, the identity."""
+    """Make a batch norm like torch's `nn.BatchNorm2d`: mean 0 and variance 1, the identity."""
     return BatchNorm(
         random_init.ones(dim), random_init.zeros(dim), random_init.zeros(dim), random_init.ones(dim)
     )
@@ -139,7 +138,7 @@ def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Convert `x` to float32 at least.
 
     Elementwise work on bfloat16 is done in float32 and rounded once. Above all, operands that a
-    parameter is broadcast over must be float32. The parameter's gradient is a sum over all tokens
+    parameter is broadcast over must be float32: the parameter's gradient is a sum over all tokens
     and images, which hardware with native bfloat16 would accumulate in 8 bits.
     """
     return x.astype(jnp.promote_types(x.dtype, jnp.float32))
@@ -153,10 +152,10 @@ def residual_sum(
 
 
 def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
-    """Map the last axis affinely, in the type of `x`, on a CPU rounded once at the end.
+    """Apply an affine map to the last axis, in the type of `x`; a CPU rounds once, at the end.
 
-    The whole batch is rows of one matrix: otherwise, for the gradient of a weight, XLA would
-    transpose the cotangent by a copy.
+    The batch is reshaped to rows of one matrix: otherwise XLA would copy the cotangent to transpose
+    it for the gradient of the weight.
     """
     y = matmul(x.reshape(-1, x.shape[-1]), params.weight)
     y = (y if params.bias is None else at_least_float32(y) + params.bias).astype(x.dtype)
@@ -164,7 +163,7 @@ def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*bat
 
 
 LinearUpdate = Callable[[str, Array], Array | None]
-"""Returns what an adapter adds to the output of the linear layer of this name, for its input."""
+"""Maps a linear layer's name and input to what an adapter adds to its output, if anything."""
 
 
 def no_update(name: str, x: Array) -> None:
@@ -180,7 +179,7 @@ def adapted_linear(
 
 
 def columns(params: Linear, start: int, stop: int) -> Linear:
-    """Return the part of a layer that computes the outputs from `start` to before `stop`."""
+    """Return the part of a layer that computes the outputs `start:stop`."""
     return jax.tree.map(lambda x: x[..., start:stop], params)
 
 
@@ -199,7 +198,7 @@ def layer_norm(
 def _standardise(x: Array, epsilon: float) -> Array:
     """Normalise the last axis to mean 0 and variance 1.
 
-    The derivative is told to JAX because by itself it would keep three arrays for it, not one.
+    The derivative is a custom rule, because JAX's own would store three arrays, not one.
     """
     return _standardised(x, epsilon)[0]
 
@@ -223,7 +222,7 @@ def _standardise_jvp(
 def depthwise_conv(
     params: DepthwiseConv, x: Float[Array, "height width dim"]
 ) -> Float[Array, "height width dim"]:
-    """Convolve every channel with its own filter (cross-correlation, as torch), with zero padding.
+    """Convolve every channel with its own filter (cross-correlation, as in torch) and zero padding.
 
     It is a sum of k x k shifted products, which XLA fuses into one pass over `x` for small filters.
     XLA's grouped convolution is many times slower on a CPU.
@@ -249,10 +248,10 @@ def conv(
     stride: int = 1,
     padding: int | None = None,
 ) -> Float[Array, "*batch rows columns d_out"]:
-    """Convolve (cross-correlate, as torch) with zero padding, in the type of `x`.
+    """Convolve (cross-correlate, as in torch) with zero padding, in the type of `x`.
 
-    The padding is half a kernel by default: a side of n pixels then becomes ceil(n / stride) for
-    kernels of odd sizes.
+    The padding is half a kernel by default, so that a side of n pixels becomes ceil(n / stride) for
+    kernels of odd size.
     """
     margin = params.weight.shape[0] // 2 if padding is None else padding
     images = x.reshape(-1, *x.shape[-3:])
@@ -269,21 +268,21 @@ def train_batch_norm(
     *,
     epsilon: float,
 ) -> tuple[Float[Array, "image *shape dim"], BatchNorm]:
-    """Normalise by the statistics of a batch, as torch in training mode, and update the running.
+    """Normalise by the statistics of a batch, like torch in training, and update the running ones.
 
-    The stored variance takes the unbiased one, the batch is divided by the biased one. Images that
-    are not valid count for nothing; a batch without any changes no statistic. Sharded over devices,
-    the statistics are those of the whole batch.
+    The running variance uses the unbiased estimate; the batch is normalised by the biased one.
+    Images that are not valid are ignored; a batch without valid images changes no statistics. For
+    a batch that is sharded over devices, the statistics are those of the whole batch.
 
     Args:
         params: the batch norm.
         x: values of a batch; the statistics are over all axes but the last.
-        valid: which images are no padding.
+        valid: which images are not padding.
         epsilon: added to the variance.
 
     Returns:
         (y, updated): the normalised values in the type of `x`, and the batch norm with updated
-        statistics, through which no gradient runs.
+        statistics, through which no gradient flows.
     """
     wide = at_least_float32(x)
     axes = tuple(range(x.ndim - 1))
@@ -312,13 +311,13 @@ def train_batch_norm(
 
 
 def split_statistics(params: PyTree) -> tuple[PyTree, PyTree]:
-    """Split parameters into the running statistics of their batch norms, and all else.
+    """Split parameters into the running statistics of their batch norms and everything else.
 
     Args:
         params: a pytree.
 
     Returns:
-        (statistics, rest): two trees of its structure, None for the other's leaves.
+        (statistics, rest): two trees of the same structure, with None for the other's leaves.
 
     Example:
         >>> statistics, rest = split_statistics(init_batch_norm(2))
@@ -336,7 +335,7 @@ def split_statistics(params: PyTree) -> tuple[PyTree, PyTree]:
 
 
 def merge_statistics(statistics: PyTree, params: PyTree) -> PyTree:
-    """Replace the running statistics in parameters by those of `split_statistics`."""
+    """Replace the running statistics in parameters with those from `split_statistics`."""
 
     def choose(new: Any, old: Any) -> Any:
         return old if new is None else new
@@ -346,9 +345,9 @@ def merge_statistics(statistics: PyTree, params: PyTree) -> PyTree:
 
 @jax.custom_jvp
 def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Apply the exact GELU, by erf: `jax.nn.gelu`'s erfc takes twice as long on a CPU.
+    """Apply the exact GELU with erf: the erfc of `jax.nn.gelu` takes twice as long on a CPU.
 
-    The derivative is told to JAX because by itself it would keep three arrays for it, not one.
+    The derivative is a custom rule, because JAX's own would store three arrays, not one.
     """
     wide = at_least_float32(x)
     return (wide * _normal_cdf(wide)).astype(x.dtype)
@@ -369,7 +368,7 @@ def _gelu_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
 
 
 def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys) -> Float[Array, "*shape"]:
-    """Zero a share `rate` of `x` and scale the rest up; return `x` for `key=None` (inference).
+    """Zero a fraction `rate` of `x` and scale the rest up; return `x` for `key=None` (inference).
 
     With one key for each entry of the leading axis, an entry's draws do not depend on the others.
     """
@@ -389,10 +388,10 @@ def split_key(key: Keys, count: int) -> list[Keys]:
 
 
 def l2_normalise(x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
-    """Scale the last axis to length 1, as torch's `F.normalize`: below 1e-12 counts as 1e-12.
+    """Scale the last axis to length 1, like torch's `F.normalize`, which divides by at least 1e-12.
 
-    The squared length is clamped above 0 before the root, so that a zero vector has gradient 0 and
-    not NaN.
+    The squared length is clamped above 0 before the root, so that a zero vector has gradient 0
+    rather than NaN.
     """
     squared = jnp.sum(x * x, axis=-1, keepdims=True)
     return x * jax.lax.rsqrt(jnp.maximum(squared, 1e-24))
@@ -407,7 +406,7 @@ def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> Two
 def two_layer(
     params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: Keys
 ) -> Float[Array, "*batch d_out"]:
-    """Apply the network, with dropout of this rate before the ReLU where there is a key."""
+    """Apply the network, with dropout of this rate before the ReLU if there is a key."""
     hidden = dropout(linear(params.fc1, x), rate, key=key)
     return linear(params.fc2, jax.nn.relu(hidden))
 
@@ -417,7 +416,7 @@ def powers(
 ) -> Float[Array, "*batch n dim"]:
     """Return sign(x) (|x| + 1e-6)^p, with an exponent from 0 to 1 for each entry of the batch.
 
-    The network makes the exponent from the mean (SAGE, ICLR 2026).
+    The network computes the exponent p from the mean (SAGE, ICLR 2026).
     """
     exponent = jax.nn.sigmoid(two_layer(params, at_least_float32(mean), 0.0, None))
     wide = at_least_float32(x)

@@ -43,7 +43,7 @@ from crisalad_jax.utils.pytree import check_drawn, expect_like, named_leaves, py
 from crisalad_jax.utils.target import widens_slices
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
-"""Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
+"""Names of linear weights, which `layers.linear` casts to the type of its input."""
 AnyArray = Array | np.ndarray
 Images = UInt8[AnyArray, "image height width 3"] | Float[AnyArray, "image height width 3"]
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -57,16 +57,16 @@ class Crisalad:
     backbone: Any
     """Parameters of `ModelConfig.backbone`."""
     aggregator: Any
-    """Parameters of `ModelConfig.aggregator`; None where it has none."""
+    """Parameters of `ModelConfig.aggregator`; None if it has none."""
     cross_image: Any
-    """Parameters of `ModelConfig.cross_image`; None where it has none."""
+    """Parameters of `ModelConfig.cross_image`; None if it has none."""
     projection: Linear | None = None
     """Parameters of `ModelConfig.projection`; None without one."""
 
 
 @brief
 class Model(NamedTuple):
-    """A model: its parameters and its configuration, which go together through the library."""
+    """A model: its parameters and its configuration, which the library passes around together."""
 
     params: Crisalad
     config: ModelConfig
@@ -77,14 +77,14 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     """Draw random parameters in float32.
 
     Args:
-        key: draws them.
+        key: random key.
         config: the model.
 
     Returns:
-        The parameters. To use DINOv2's weights, replace `backbone` by them.
+        The parameters. To use DINOv2's weights, replace `backbone` with them.
 
     Raises:
-        InputError: a part of a plug-in that returns anything but a pytree of float32 arrays.
+        InputError: a plug-in part returns anything but a pytree of float32 arrays.
 
     Example:
         >>> import jax
@@ -116,19 +116,19 @@ def parameter_shapes(config: ModelConfig) -> Crisalad:
 
 @takes(params=Crisalad, config=ModelConfig)
 def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> None:
-    """Check that parameters are those of a configuration: names, shapes and types.
+    """Check that parameters match a configuration: names, shapes and types.
 
-    Traced parameters pass as arrays do, and so do those that training has cast or cut:
-    `config.compute_dtype` may stand for float32, and blocks may be in several stacks.
+    Traced parameters pass too, as do those that training has cast or split: the type may be
+    `config.compute_dtype` instead of float32, and blocks may be in several stacks.
 
     Args:
         params: the parameters.
         config: the model.
-        stored: whether a file is to keep them, which takes whole, finite float32 arrays alone.
+        stored: whether they are to be saved, which needs unsplit, finite float32 arrays.
 
     Raises:
-        InputError: they are not, the first differences are listed; or the model computes in
-            float64, outside of JAX's 64-bit mode.
+        InputError: they do not match, and the first differences are listed; or the model computes
+            in float64 outside of JAX's 64-bit mode.
 
     Example:
         >>> import jax
@@ -152,7 +152,7 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
         dtypes = {jnp.dtype(config.compute_dtype)}
         problems = diff_trees(params, template, dtypes)
         if problems:
-            with contextlib.suppress(Exception):  # there may be anything in the place of the blocks
+            with contextlib.suppress(Exception):  # the blocks may be anything
                 backbone = jax.eval_shape(config.backbone.join_blocks, params.backbone)
                 joined = dataclasses.replace(params, backbone=backbone)
                 problems = diff_trees(joined, template, dtypes)
@@ -163,17 +163,17 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
 def cast_params(params: Any, config: ModelConfig) -> Any:
     """Cast the weights of the backbone's large linear layers to the type of their products.
 
-    Otherwise every call casts them. Descriptors stay the same to the bit. In bfloat16 the weights
-    take half the memory, and no longer train; where XLA would widen them again in every call
-    (`widens_slices`), they stay float32. In float64 all parameters are cast, so that none of their
-    sums is rounded to float32.
+    Otherwise every call casts them. Descriptors stay the same, bit for bit. In bfloat16 the weights
+    take half the memory and can no longer be trained; if XLA would widen them again in every call
+    (`widens_slices`), they stay float32. In float64 all parameters are cast, so that no sum is
+    rounded to float32.
 
     Args:
         params: the parameters, or a tree of these with some left out.
         config: the model.
 
     Returns:
-        The parameters that `describe` takes as well. In float32 they are `params`, not copied.
+        Parameters that `describe` accepts as well. In float32 they are `params` itself.
 
     Example:
         >>> import jax
@@ -197,10 +197,10 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
 
 @takes(model=Model)
 def merge_adapters(model: Model) -> Model:
-    """Merge adapters into the weights that they update, for inference at the cost of the backbone.
+    """Merge adapters into the weights that they update, for inference at the backbone's cost.
 
     The descriptors are the same up to rounding. LoRA can be merged (W + alpha / rank B A, Hu et al.
-    2021, section 4.1); adapters that act elsewhere than on a weight cannot.
+    2021, section 4.1); adapters that do not act on a weight cannot.
 
     Args:
         model: a model with adapters.
@@ -229,9 +229,9 @@ def merge_adapters(model: Model) -> Model:
 
 
 def _of_images(function: _F) -> _F:
-    """Make a compiled function of images know the devices that they are on.
+    """Let a compiled function of images know which devices they are on.
 
-    The pixels' values, which a trace does not know, are checked before it is called.
+    Pixel values, which a trace does not know, are checked before the call.
     """
     spread = over_images("images", 1)(function)
 
@@ -255,34 +255,34 @@ def describe(
     key: Key[Array, ""] | None = None,
     micro_batch: int | None = None,
 ) -> Float[Array, "image descriptor"]:
-    """Describe a batch of RGB images by unit vectors.
+    """Compute the descriptors of a batch of RGB images, as unit vectors.
 
-    With a cross-image encoder a descriptor depends on the images that `mask` lets it attend to:
+    With a cross-image encoder, a descriptor depends on the images that `mask` lets it attend to:
     `mask[i, j]` allows image i to attend to image j, and None allows all. An image that may attend
     to none attends to itself. See `self_mask` and `valid_mask`.
 
-    It works under `jax.jit`, `jax.vmap` and reverse mode (`jax.grad`, `jax.jacrev`), once and
-    twice. Forward mode (`jax.jvp`, `jax.hessian`) does not work: the gradients of attention and max
-    pooling are written out, for speed. Take `jax.jacrev` of `jax.grad` for a Hessian. On an
-    accelerator, where attention is fused, the gradient can be taken once.
+    It supports `jax.jit`, `jax.vmap` and reverse mode (`jax.grad`, `jax.jacrev`), once or twice.
+    Forward mode (`jax.jvp`, `jax.hessian`) is not supported: attention and max pooling have custom
+    gradients, for speed. For a Hessian, use `jax.jacrev` of `jax.grad`. On an accelerator, where
+    attention is fused, the gradient can be taken only once.
 
     Args:
         params: from `init_crisalad` or a weight file.
         images: 8-bit pixels, which are normalised here as `config.preprocessing` says, or floats
-            that already are (pixels of 0 to 1 or to 255 as floats are refused). The sides are such
-            as the backbone takes; they need not be `config.image_size`. See `prepare_image`.
+            that already are (float pixels from 0 to 1 or 0 to 255 are rejected). The sides may be
+            any that the backbone accepts, not only `config.image_size`. See `prepare_image`.
         config: the model, static.
         mask: which images attend to which.
-        key: draws the dropout (a `jax.random.key`); None means inference.
+        key: a `jax.random.key` for dropout; None means inference.
         micro_batch: see `extract_tokens`; images still attend to the whole batch.
 
     Returns:
-        Descriptors of length 1 where the model has `unit_length`, in float32 at least.
+        Descriptors in float32 at least, of length 1 if the model has `unit_length`.
 
     Raises:
-        InputError: parameters that are not of the configuration; while tracing, for images of the
-            wrong type, rank, channels or sides, none, or with too few patches for the clusters; a
-            mask of another shape; or a batch is no multiple of `micro_batch`.
+        InputError: the parameters do not match the configuration; or, while tracing, there are no
+            images, images of a wrong type, rank, channels or sides, or too few patches for the
+            clusters; the mask has a wrong shape; or `micro_batch` does not divide the batch.
 
     Example:
         >>> import jax, numpy as np
@@ -307,11 +307,11 @@ def extract_tokens(
     key: Key[Array, ""] | None = None,
     micro_batch: int | None = None,
 ) -> Tokens:
-    """Extract every image's tokens, which depend on no other image: the first half of `describe`.
+    """Extract the tokens of each image independently: the first half of `describe`.
 
-    With `micro_batch` the backbone runs on that many images at a time, and again for the gradient.
+    With `micro_batch`, the backbone runs on that many images at a time, and again for the gradient.
     Memory then holds the activations of one micro-batch (as in GradCache, Gao et al. 2021). Tokens
-    and gradients equal those of the whole batch up to rounding, dropout included.
+    and gradients equal those of the whole batch up to rounding, including dropout.
 
     Args:
         params: see `describe`.
@@ -346,29 +346,29 @@ def tokens_and_statistics(
     key: Key[Array, ""] | None = None,
     micro_batch: int | None = None,
 ) -> tuple[Tokens, Crisalad | None]:
-    """Extract tokens in a trace, in training by the statistics of the batch.
+    """Extract tokens while tracing, in training with the statistics of the batch.
 
-    Where the backbone has batch norms, these normalise by the mean and variance of the batch's
-    valid images, as torch's in training mode. So a token depends on the other images. Devices that
-    share a batch share its statistics. A micro-batch is a forward pass of its own: it has its own
+    If the backbone has batch norms, they normalise by the mean and variance of the batch's valid
+    images, like torch in training mode, so a token depends on the other images. Devices that share
+    a batch share its statistics. Each micro-batch is a separate forward pass: it has its own
     statistics, and updates the running ones in turn.
 
     Args:
         params: see `describe`.
         images: see `describe`.
         config: see `describe`.
-        valid: images that the statistics are taken of; None takes the stored ones.
+        valid: images that the statistics are taken from; None uses the stored ones.
         key: see `describe`.
         micro_batch: see `extract_tokens`.
 
     Returns:
-        (tokens, statistics): a tree of the structure of `params`, which holds the running
-        statistics after this batch, and None for all other leaves; None where `valid` is None.
+        (tokens, statistics): `statistics` is a tree of the structure of `params` with the running
+        statistics after this batch, and None for all other leaves; it is None if `valid` is.
 
     Raises:
         InputError: as `describe`.
     """
-    count = images.shape[0]  # which may be symbolic, where `len` is not
+    count = images.shape[0]  # may be symbolic, unlike `len`
     keys = None if key is None else jax.random.split(key, count)
     require(
         micro_batch is None or count % micro_batch == 0,
@@ -377,8 +377,8 @@ def tokens_and_statistics(
     mesh = image_mesh()
     if mesh is None or valid is not None:
         return _tokens_in_parts(params, images, valid, config, keys, micro_batch)
-    # Without statistics of the batch a device needs nothing of the others. XLA's partitioner would
-    # not see it in loops over images, and would sum gradients layer by layer.
+    # Without batch statistics, a device needs nothing from the others. XLA's partitioner would
+    # not see that in loops over images, and would sum gradients layer by layer.
     own = count // mesh.size
     if micro_batch is not None:
         at_once = max(1, micro_batch // mesh.size)
@@ -393,7 +393,7 @@ def tokens_and_statistics(
         mesh=mesh,
         in_specs=(alike, shared, shared),
         out_specs=shared,
-        check_vma=False,  # whose rules parts of plug-ins need not follow
+        check_vma=False,  # plug-in parts need not follow its rules
     )
     return extract(params, images, keys), None
 
@@ -441,7 +441,7 @@ def _tokens_in_parts(
 @_of_images
 @functools.partial(compiler.jit, static_argnames="config")
 def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
-    """Extract the features of every image that the aggregator requests.
+    """Extract from every image the features that the aggregator requests.
 
     Args:
         params: see `describe`.
@@ -449,7 +449,7 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
         config: see `describe`.
 
     Returns:
-        The features that the aggregator asks for.
+        The requested features.
 
     Raises:
         InputError: as `describe`.
@@ -473,7 +473,7 @@ def _extract_features(
     valid: Bool[Array, " image"] | None = None,
     with_insertion: bool = True,
 ) -> tuple[Features, Crisalad]:
-    """Extract features; return parameters with updated statistics, as `Backbone.apply` does."""
+    """Extract features, and return parameters with updated statistics, as `Backbone.apply` does."""
     check_params(params, config)
     images, params = _normalised(images, config), _widened(params, config)
     request = config.aggregator.features(config.backbone.depth)
@@ -520,7 +520,7 @@ def unit_features(
 ) -> Float[Array, "image patch dim"]:
     """Return the aggregator's patch features as unit vectors, for vocabularies.
 
-    They are in float32 at least. Tokens of the aggregator's own do not run through the backbone.
+    They are in float32 at least. Tokens that the aggregator inserts are left out of the backbone.
 
     Raises:
         InputError: as `describe`.
@@ -539,13 +539,13 @@ def attend_across_images(
     mask: Bool[AnyArray, "image image"] | None = None,
     key: Key[Array, ""] | None = None,
 ) -> Float[Array, "image descriptor"]:
-    """Attend across images and make their descriptors, the second half of `describe`.
+    """Attend across images and compute their descriptors: the second half of `describe`.
 
     To describe the same images in several groupings, extract their tokens once.
 
     Args:
         params: see `describe`.
-        tokens: of `extract_tokens`.
+        tokens: from `extract_tokens`.
         config: see `describe`.
         mask: see `describe`.
         key: see `describe`.
@@ -554,8 +554,8 @@ def attend_across_images(
         See `describe`.
 
     Raises:
-        InputError: parameters or tokens that are not of the configuration, or, while tracing, a
-            mask of another shape.
+        InputError: the parameters or tokens do not match the configuration, or, while tracing, the
+            mask has a wrong shape.
 
     Example:
         >>> import jax, numpy as np
@@ -598,7 +598,7 @@ def attend_across_images(
 
 
 def _sequence(tokens: Tokens, config: ModelConfig) -> Float[Array, "image token dim"]:
-    """Return what the cross-image encoder takes: tokens, or a descriptor that is cut into some."""
+    """Return the input of the cross-image encoder: tokens, or a descriptor cut into pieces."""
     encoder = config.cross_image
     if encoder.width is None:
         sequence = as_sequence(tokens, global_token=encoder.global_token)
@@ -615,7 +615,7 @@ def _checked_mask(
     """Return the mask of `describe`, in which an image that may attend to none attends to itself.
 
     Raises:
-        InputError: it has another shape.
+        InputError: it has a wrong shape.
     """
     if mask is None:
         return None
@@ -632,24 +632,24 @@ def _checked_mask(
 def attention_maps(
     params: Crisalad, images: Images, config: ModelConfig, *, block: int = -1
 ) -> Float[Array, "image head token token"]:
-    """Compute the attention of a block of a vision transformer.
+    """Compute the attention maps of a block of a vision transformer.
 
-    Entry (i, j) of a head's map is how much of token j the token i takes; rows sum to 1. Tokens are
-    the class token, the registers, then the patches in row order: `maps[:, :, 0, 1 + registers:]`
-    is what the class token takes of the patches.
+    Entry (i, j) of a head's map is the weight of token j for token i; rows sum to 1. Tokens are the
+    class token, the registers, then the patches in row order: `maps[:, :, 0, 1 + registers:]` has
+    the weights of the patches for the class token.
 
     Args:
         params: see `describe`.
         images: see `describe`.
         config: see `describe`.
-        block: number of the block, from 0; negative numbers count from the last.
+        block: index of the block, from 0; negative indices count from the last.
 
     Returns:
         The softmax of the scores, in float32 at least.
 
     Raises:
-        InputError: the backbone has no such block or no attention, or adapters on a side path; or
-            as `describe`.
+        InputError: the backbone has no such block, no attention, or adapters on a side path; or as
+            `describe`.
 
     Example:
         >>> import jax, numpy as np
@@ -686,11 +686,11 @@ def cross_image_attention(
     *,
     mask: Bool[AnyArray, "image image"] | None = None,
 ) -> Float[Array, "layer token head image image"]:
-    """Compute which images attend to which in the layers of the cross-image encoder.
+    """Compute the attention between images in the layers of the cross-image encoder.
 
-    Entry (i, j) is how much of image j's token the same token of image i takes; rows sum to 1. The
-    tokens are those of the global token, cut as the encoder takes it, then the clusters; or the
-    pieces of a descriptor that the encoder cuts.
+    Entry (i, j) is the weight of image j's token for the same token of image i; rows sum to 1. The
+    tokens are the pieces of the global token that the encoder cuts it into, then the clusters; or
+    the pieces of the descriptor, if the encoder cuts that.
 
     Args:
         params: see `describe`.
@@ -729,21 +729,21 @@ def describe_training_batch(
     micro_batch: int | None = None,
     sub_batches: Sequence[int] = (),
 ) -> tuple[Float[Array, "image descriptor"], Tokens, Crisalad | None]:
-    """Describe a batch in the trace of a training step.
+    """Compute the descriptors of a batch while tracing a training step.
 
     Args:
         params: see `describe`.
         images: see `describe`.
         config: see `describe`.
         valid: images that attend to each other; the others attend to themselves.
-        measured: images that batch norms take their statistics of; None takes the stored ones.
-        key: draws the dropout; None is without.
+        measured: images that batch norms take their statistics from; None uses the stored ones.
+        key: random key for dropout; None means no dropout.
         micro_batch: see `extract_tokens`.
-        sub_batches: numbers of images that attend to each other, one after the other; none are one.
+        sub_batches: sizes of consecutive groups whose images attend to each other; none are one.
 
     Returns:
         (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them. The
-        descriptors are unit vectors, as losses take them, whatever the model leaves them.
+        descriptors are unit vectors, as losses expect, even if the model does not normalise them.
     """
     tokens_key, cross_key = split_key(key, 2)
     tokens, statistics = tokens_and_statistics(
@@ -764,9 +764,9 @@ def describe_training_batch(
 def transport_masses(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch column"]:
-    """Compute the mass that a transport sends from each patch, in row order, to each cluster.
+    """Compute the mass that the transport plan sends from each patch to each cluster.
 
-    A patch sends a mass of 1. If there is a dustbin, it is the last column.
+    Patches are in row order; each sends a mass of 1. If there is a dustbin, it is the last column.
 
     Args:
         params: see `describe`.
@@ -791,7 +791,7 @@ def transport_masses(
 
 
 def self_mask(count: Any) -> Bool[Array, "image image"]:
-    """Return the mask that lets every image attend to itself alone, independent of its batch.
+    """Return the mask that lets every image attend only to itself, whatever its batch.
 
     Args:
         count: number of images in the batch, which may be symbolic in an export.
@@ -810,7 +810,7 @@ def valid_mask(valid: Bool[Array, " image"]) -> Bool[Array, "image image"]:
     """Return the mask that lets valid images attend to each other, and the others to themselves.
 
     Args:
-        valid: which images are no padding.
+        valid: which images are not padding.
 
     Returns:
         A mask for `describe`.
@@ -824,16 +824,16 @@ def valid_mask(valid: Bool[Array, " image"]) -> Bool[Array, "image image"]:
 
 
 def params_of(arrays: Mapping[str, np.ndarray], config: ModelConfig, *, source: str) -> Crisalad:
-    """Make parameters of stored arrays by their dotted names.
+    """Build parameters from stored arrays, by their dotted names.
 
     Args:
-        arrays: whole, finite float32 arrays.
+        arrays: unsplit, finite float32 arrays.
         config: the model.
         source: the file, for messages.
 
     Raises:
-        InputError: they are not all parameters of the model, and no others; the first differences
-            are listed.
+        InputError: they are not exactly the parameters of the model; the first differences are
+            listed.
 
     Example:
         >>> import jax
@@ -847,7 +847,7 @@ def params_of(arrays: Mapping[str, np.ndarray], config: ModelConfig, *, source: 
 
 
 def tree_of(arrays: Mapping[str, np.ndarray], template: _T, *, source: str) -> _T:
-    """Make a tree of stored arrays by their dotted names.
+    """Build a tree from stored arrays, by their dotted names.
 
     Args:
         arrays: finite arrays.
@@ -855,7 +855,7 @@ def tree_of(arrays: Mapping[str, np.ndarray], template: _T, *, source: str) -> _
         source: the file, for messages.
 
     Raises:
-        InputError: they are not those of the template; the first differences are listed.
+        InputError: they do not match the template; the first differences are listed.
     """
     names = named_leaves(template)
     problems = diff_trees(arrays, names) or not_finite(arrays)

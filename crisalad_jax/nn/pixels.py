@@ -14,29 +14,29 @@ from crisalad_jax.utils.errors import InputError
 LOCAL_WINDOW = 21
 """Side in pixels of the box of local contrast normalisation: one and a half patches."""
 LOCAL_NOISE = 0.02
-"""Smallest deviation, as a share of full scale: a night photograph's noise, not to be amplified."""
+"""Smallest deviation, as a share of full scale, so that noise at night is not amplified."""
 
 _BYTES_FROM = 30.0
-"""Numbers above this are pixels of 0 to 255. ImageNet's normalisation gives at most 2.7, and that
-of local contrast at most 21, the root of its window's size. Other means and deviations may give
-more."""
+"""Values above this are pixels from 0 to 255. ImageNet's normalisation gives at most 2.7, and that
+by local contrast at most 21, the square root of its window's size. Other means and deviations may
+give more."""
 _OVERSHOOT = 1.5
-"""Range of what a bicubic filter on floats gives, for pixels of a range of 1."""
+"""Range of a bicubic filter's output on float pixels with a range of 1."""
 _SPREAD = 0.5
-"""Least range of pixels of 0 to 1. Normalised images that lie inside of it are nearly uniform."""
+"""Least range of pixels from 0 to 1. Normalised images within 0 to 1 are nearly uniform."""
 
 
 def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) -> None:
-    """Check that images are an array, and that floats are normalised and no plain pixels.
+    """Check that images are an array, and that floats are normalised, not plain pixels.
 
-    Values that are traced, or lie with other processes, are not known, and pass.
+    Values that are traced, or held by other processes, are unknown and pass.
 
     Args:
         images: 8-bit pixels, or floats.
         how: how they are normalised.
 
     Raises:
-        InputError: they are no array, or floats of 0 to 255 or of 0 to 1.
+        InputError: they are not an array, or are floats from 0 to 255 or from 0 to 1.
 
     Example:
         >>> import numpy as np
@@ -74,7 +74,7 @@ def normalise(
 
     "mean-deviation" subtracts the mean and divides by the deviation, by default ImageNet's, as
     DINOv2 expects. "local-contrast" uses those of each pixel's 21 x 21 neighbourhood. It is for
-    small models trained from scratch, which would have to learn to ignore the light.
+    small models trained from scratch, which would otherwise have to learn to ignore lighting.
     """
     # JAX's default float type: float64 for a model that computes in it (`compiler.number_types`).
     pixels = image.astype(float) / 255
@@ -95,6 +95,6 @@ def _local_contrast(image: Float[Array, "height width 3"]) -> Float[Array, "heig
 
 
 def _box(side: int) -> np.ndarray:
-    """Make a (side, side) averaging matrix; at the border it averages the box's inside part."""
+    """Make a (side, side) averaging matrix; at the border it averages the part inside the image."""
     near = np.abs(np.arange(side)[:, None] - np.arange(side)) <= LOCAL_WINDOW // 2
     return near / near.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Products of matrices and convolutions, in the types that are fastest on each platform."""
+"""Matrix products and convolutions, in the types that are fastest on each platform."""
 
 import functools
 from collections.abc import Callable
@@ -14,34 +14,34 @@ from crisalad_jax.utils.target import target, widens_slices
 
 
 def product_precision(dtype: Any) -> jax.lax.Precision | None:
-    """Return the precision of a product of matrices of `dtype`; None is what JAX is set to.
+    """Return the precision of a matrix product in `dtype`; None is JAX's setting.
 
-    A pass takes numbers of 8 bits as they are, so that bfloat16 needs one.
+    A pass multiplies numbers of 8 bits exactly, so bfloat16 needs only one.
     """
     single = dtype == jnp.bfloat16 and target().platform != "cpu"
     return jax.lax.Precision.DEFAULT if single else None
 
 
 def rule_precision(dtype: Any) -> str | None:
-    """Return the precision of products, for rules whose backward half is traced outside of it."""
+    """Return the products' precision, for rules whose backward half is traced outside its scope."""
     if product_precision(dtype) is not None:
         return "default"
     return None if target().platform == "cpu" else jax.config.jax_default_matmul_precision  # pyright: ignore
 
 
 def row_major(x: Array) -> Array:
-    """Lay an array out in the order of its axes.
+    """Lay out an array in the order of its axes.
 
-    XLA's library for CPUs takes a bfloat16 product whose left side ends with the axis that is
-    summed over, where both sides are laid out so; others are computed in float32.
+    XLA's library for CPUs supports a bfloat16 product only if both sides are laid out like this,
+    and the left one ends with the axis that is summed over; others are computed in float32.
     """
     return with_layout_constraint(x, Layout(tuple(range(x.ndim))))
 
 
 def keep(x: Array, name: str) -> Array:
-    """Name a result that a policy of `jax.checkpoint` keeps for the gradient.
+    """Name a result that a policy of `jax.checkpoint` saves for the gradient.
 
-    Where XLA would widen all that is kept in bfloat16 (`widens_slices`), its bits are kept.
+    Where XLA would widen everything saved in bfloat16 (`widens_slices`), its bits are saved.
     """
     if x.dtype == jnp.bfloat16 and widens_slices():
         return _keep_bits(x, name)
@@ -60,10 +60,10 @@ def _keep_bits_jvp(name: str, primals: tuple[Array], tangents: tuple[Array]) -> 
 
 
 def map_first_axis(function: Callable[[Any], Array], stacks: Any) -> Array:
-    """Call a function for every index of the first axis of a tree of arrays, one after the other.
+    """Map a function over the first axis of a tree of arrays, one index after the other.
 
     Where XLA would widen a stack of bfloat16 (`widens_slices`), the loop reads and writes its bits.
-    It can't be differentiated.
+    The map can't be differentiated.
     """
 
     def bits(x: Array) -> Array:
@@ -101,13 +101,13 @@ def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -
 def _narrow_matmul(rows: Array, weight: Array) -> Array:
     """Multiply in bfloat16 in both directions: JAX's own rule takes the float32 cotangent as it is.
 
-    It is rounded to the type of the result, which `linear` rounds too.
+    Here it is rounded to bfloat16, as `linear` rounds the result.
     """
     return jnp.matmul(rows, weight.astype(rows.dtype), preferred_element_type=jnp.float32)
 
 
 def _narrow_forward(rows: Any, weight: Any) -> tuple[Array, tuple[Array | None, Array]]:
-    kept = rows.value if weight.perturbed else None  # which a frozen weight's gradient needs
+    kept = rows.value if weight.perturbed else None  # a frozen weight has no gradient
     return _narrow_matmul(rows.value, weight.value), (kept, weight.value)
 
 
@@ -132,7 +132,7 @@ def convolve(
     stride: int,
     margin: int,
 ) -> Float[Array, "image rows columns d_out"]:
-    """Convolve images, with zeros around them, by a weight that is cast to their type."""
+    """Convolve images, padded with zeros, with a weight that is cast to their type."""
     convolution = functools.partial(
         jax.lax.conv_general_dilated, precision=product_precision(images.dtype)
     )
@@ -142,14 +142,14 @@ def convolve(
             images,
             weight.astype(images.dtype),
             window_strides=(stride, stride),
-            # Not "SAME", which pads less before the image than after it where the stride is 2.
+            # Not "SAME", which pads less before the image than after it if the stride is 2.
             padding=((margin, margin), (margin, margin)),
             dimension_numbers=("NHWC", "HWIO", "NHWC"),
         )
 
     def weight_gradient(images: Array, change: Array, weight: Array) -> Array:
-        # By the cotangent, whose pixels are `stride` apart, with the images as channels. What no
-        # window reached is cut off at the end.
+        # Convolve with the cotangent, whose pixels are `stride` apart, and the images as channels.
+        # Pixels that no window reached are cut off at the end.
         sides = zip(weight.shape, change.shape[1:3], images.shape[1:3], strict=False)
         ends = [size + stride * (rows - 1) - length - margin for size, rows, length in sides]
         return convolution(
@@ -171,10 +171,10 @@ def _with_wide_gradient(
     x: Array,
     weight: Array,
 ) -> Array:
-    """Compute product(x, weight); on accelerators sum the gradient of a wider weight in its type.
+    """Compute product(x, weight); on accelerators, sum a wider weight's gradient in its type.
 
-    JAX's rule rounds it to bfloat16 before the sum over devices. A CPU's devices, which are
-    virtual, do without: its program stays as it is.
+    JAX's rule rounds it to bfloat16 before the sum over devices. A CPU's devices are virtual and
+    do without this, so that its program stays the same.
     """
     if x.dtype != jnp.bfloat16 or weight.dtype == x.dtype or target().platform == "cpu":
         return product(x, weight)

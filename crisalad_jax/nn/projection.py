@@ -1,4 +1,4 @@
-"""Project whole descriptors by a linear layer, such as MegaLoc's last one or a stored whitening."""
+"""Project descriptors by a linear layer, such as MegaLoc's last layer or a stored whitening."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ from crisalad_jax.nn.layers import Linear, l2_normalise, linear
 @short_repr(switch=("dim", 0))
 @dataclasses.dataclass(frozen=True)
 class ProjectionConfig:
-    """A linear layer with a bias over the unit descriptor, the last of a model.
+    """A linear layer with a bias over the unit descriptor, the last layer of a model.
 
     Example:
         >>> ProjectionConfig(dim=4096).renormalise
@@ -22,7 +22,7 @@ class ProjectionConfig:
     dim: NonNegativeInt = 0
     """Width of the projected descriptor. 0 leaves the layer out."""
     renormalise: bool = True
-    """Whether projected descriptors are made unit vectors again."""
+    """Whether projected descriptors are normalised again."""
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -32,6 +32,6 @@ class ProjectionConfig:
 def project(
     params: Linear, descriptors: Float[Array, "image descriptor"], config: ProjectionConfig
 ) -> Float[Array, "image projected"]:
-    """Project descriptors, and make them unit vectors if asked to."""
+    """Project descriptors, and normalise them if `config.renormalise` is set."""
     projected = linear(params, descriptors)
     return l2_normalise(projected) if config.renormalise else projected

@@ -1,9 +1,9 @@
-"""Draw initial parameters: the numbers of `jax.random`, from a handful of compiled programs.
+"""Draw the initial parameters that `jax.random` draws, with only a few compiled programs.
 
-`jax.random` compiles a program for every shape, which takes 9 s for a model. Here one program of
-each distribution draws `_CHUNK` numbers, and is called until there are enough: 1 to 2 s. The bits
-of JAX's threefry depend on the key and the place alone, so the numbers are those of `jax.random`.
-While JAX traces, and for keys of other generators, `jax.random` draws itself. All numbers are
+`jax.random` compiles a program for every shape, which takes 9 s for a model. Here one program per
+distribution draws `_CHUNK` numbers, and is called until there are enough: 1 to 2 s. The bits of
+JAX's threefry depend only on the key and the position, so the numbers are those of `jax.random`.
+While JAX traces, and for keys of other generators, `jax.random` itself is used. All numbers are
 float32, in JAX's 64-bit mode too.
 """
 
@@ -22,15 +22,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 _CHUNK = 2**16
 """Numbers that one call of a program draws."""
 _MOST_KEYS = 64
-"""Keys that a key is always split into: the first ones do not depend on their number."""
+"""Number of keys that a key is always split into; the first keys do not depend on it."""
 
 Shape = Sequence[int]
 
 
 def _bits_from(data: Array, bit_width: int, shape: Shape) -> Array:
-    """Draw the 32 bits of places `data[2]` and on, with the key `data[:2]`.
+    """Draw 32 bits for each position from `data[2]` on, with the key `data[:2]`.
 
-    Each place is a counter of 64 bits, whose two encrypted words are combined, as JAX has it.
+    A position is a counter of 64 bits, whose two encrypted words are combined, as in JAX.
     """
     assert bit_width == 32
     low = data[2] + jnp.arange(math.prod(shape), dtype=jnp.uint32)
@@ -61,7 +61,7 @@ def _chunk(key: Array, distribution: Callable[..., Array], **limits: Any) -> Arr
 
 
 def _is_plain(key: Any) -> bool:
-    """Return whether a key is a concrete one of the generator whose bits are drawn here."""
+    """Return whether a key is concrete and of the generator that is implemented here."""
     if isinstance(key, Tracer) or not jax.config.jax_threefry_partitionable:  # pyright: ignore
         return False
     return str(jax.random.key_impl(key)) == "threefry2x32"
@@ -86,24 +86,24 @@ def _draw(
 def uniform(
     key: PRNGKeyArray, shape: Shape, *, minval: float, maxval: float
 ) -> Float[Array, "*shape"]:
-    """Draw what `jax.random.uniform` draws."""
+    """Draw the same numbers as `jax.random.uniform`."""
     return _draw(jax.random.uniform, key, shape, minval=minval, maxval=maxval)
 
 
 def normal(key: PRNGKeyArray, shape: Shape, *, scale: float = 1.0) -> Float[Array, "*shape"]:
-    """Draw what `jax.random.normal` draws, times `scale`."""
+    """Draw the same numbers as `jax.random.normal`, times `scale`."""
     return _draw(jax.random.normal, key, shape, scale)
 
 
 def truncated_normal(
     key: PRNGKeyArray, lower: float, upper: float, shape: Shape, *, scale: float = 1.0
 ) -> Float[Array, "*shape"]:
-    """Draw what `jax.random.truncated_normal` draws, times `scale`."""
+    """Draw the same numbers as `jax.random.truncated_normal`, times `scale`."""
     return _draw(jax.random.truncated_normal, key, shape, scale, lower=lower, upper=upper)
 
 
 def split(key: PRNGKeyArray, num: int = 2) -> list[PRNGKeyArray]:
-    """Split a key as `jax.random.split` does, by one program for every `num`."""
+    """Split a key as `jax.random.split` does, with one program for every `num`."""
     return list(jax.random.split(key, max(num, _MOST_KEYS)))[:num]
 
 
@@ -119,15 +119,15 @@ def stacked(draw: Callable[[PRNGKeyArray], Any], keys: Sequence[PRNGKeyArray]) -
 
 
 def full(shape: Shape, value: float) -> Float[Array, "*shape"]:
-    """Make a float32 array of one value, without a program for it."""
+    """Make a float32 array of one value, without compiling a program."""
     return jax.device_put(np.full(shape, value, np.float32))
 
 
 def zeros(*shape: int) -> Float[Array, "*shape"]:
-    """Make a float32 array of zeros, without a program for it."""
+    """Make a float32 array of zeros, without compiling a program."""
     return full(shape, 0.0)
 
 
 def ones(*shape: int) -> Float[Array, "*shape"]:
-    """Make a float32 array of ones, without a program for it."""
+    """Make a float32 array of ones, without compiling a program."""
     return full(shape, 1.0)

@@ -1,4 +1,4 @@
-"""The tokens that an aggregator makes of an image, and that become a descriptor."""
+"""The tokens that an aggregator makes from an image, and that become its descriptor."""
 
 from typing import NamedTuple
 
@@ -9,19 +9,19 @@ from crisalad_jax.config.short_repr import brief
 
 
 class TransportStatistics(NamedTuple):
-    """Statistics of a transport, for a log."""
+    """Statistics of a transport plan, for logging."""
 
     marginal_error: Float[Array, "*batch"]
     """Largest relative error of a cluster's mass."""
     dustbin_share: Float[Array, "*batch"]
     """Share of all mass that went to the dustbin."""
     patches_per_cluster: Float[Array, "*batch"]
-    """Effective number of patches in a cluster, exp(entropy of its mass), as a mean of clusters."""
+    """Effective number of patches per cluster, exp(entropy of its mass), averaged over clusters."""
 
 
 @brief
 class Tokens(NamedTuple):
-    """One global token an image, and local tokens: of SALAD's clusters, or a pyramid's regions.
+    """One global token per image, and local tokens: SALAD's clusters, or a pyramid's regions.
 
     Example:
         >>> import jax.numpy as jnp
@@ -34,11 +34,11 @@ class Tokens(NamedTuple):
     transport: TransportStatistics | None = None
     """Statistics of the image; None without a transport, or after the cross-image encoder."""
     dense: Float[Array, "*batch feature local"] | None = None
-    """Local features of an image for a loss that compares them (SelaVPR); in training alone."""
+    """Local features of an image for a loss that compares them (SelaVPR); only in training."""
 
     @classmethod
     def of_global(cls, token: Float[Array, "*batch dim"]) -> "Tokens":
-        """Return a global token, and zero local tokens of its width."""
+        """Return a global token, and an empty array of local tokens of its width."""
         return cls(token, token[..., None, :][..., :0, :])
 
     @classmethod
@@ -59,7 +59,7 @@ def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "*batch t
 def from_sequence(
     sequence: Float[Array, "*batch token dim"], before: Tokens, *, global_token: bool
 ) -> Tokens:
-    """Undo `as_sequence`; a global token that took no part is the one from `before`."""
+    """Undo `as_sequence`; a global token that took no part is taken from `before`."""
     if not global_token:
         return Tokens(before.global_token, sequence)
     pieces = sequence.shape[-2] - before.local.shape[-2]

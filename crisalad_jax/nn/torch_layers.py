@@ -21,7 +21,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class EncoderLayer:
-    """Attention and feed-forward network, a layer norm after each."""
+    """Attention and feed-forward network, with a layer norm after each."""
 
     attn: Attention
     linear1: Linear
@@ -54,12 +54,12 @@ def encoder_layer(
     """Add the attention's output and then the feed-forward network's, with a layer norm after each.
 
     Args:
-        params: the layer; its attention has been applied.
+        params: the layer, whose attention has already been applied.
         x: the tokens that went into the attention.
         attended: the attention's output.
-        activation: of the network's hidden layer.
-        rate: of dropout: of the attention's output, the hidden layer and the network's output.
-        keys: of these three; None means inference.
+        activation: activation of the network's hidden layer.
+        rate: dropout rate of the attention's output, the hidden layer and the network's output.
+        keys: random keys for these three dropouts; None means inference.
     """
     x = x + dropout(attended, rate, key=keys[0])
     x = layer_norm(params.norm1, x)

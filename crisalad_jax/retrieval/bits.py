@@ -25,7 +25,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float32, UInt8
 
 Bits = UInt8[np.ndarray, "n bytes"]
-"""Packed bits of n images, a row each."""
+"""Packed bits of n images, one row each."""
 _ROWS = 4096
 """Number of database rows compared at a time."""
 _PIECE = 2**16
@@ -33,13 +33,13 @@ _PIECE = 2**16
 
 
 def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8"]:
-    """Pack the signs of descriptors: a bit is 1 where a number is at least 0.
+    """Pack the signs of descriptors: a bit is 1 where a value is at least 0.
 
-    The first dimension is the highest bit of the first byte, as of `numpy.packbits`. That 0 gives 1
-    is the rule of SelaVPR++; TeTRA's gives 0 there, and is the same for all other numbers.
+    The first dimension is the highest bit of the first byte, as in `numpy.packbits`. Mapping 0 to 1
+    is the rule of SelaVPR++; TeTRA maps 0 to 0, and all other values the same way.
 
     Args:
-        descriptors: of the n images, of d numbers each, of any length; d is a multiple of 8.
+        descriptors: of the n images, of any norm; d is a multiple of 8.
 
     Returns:
         The packed bits, as `search` takes them.
@@ -56,7 +56,7 @@ def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8
 
 
 def to_bits(array: np.ndarray, name: str, length: int) -> Bits:
-    """Pack descriptors of `length` numbers, or check those that are packed.
+    """Pack descriptors of `length` dimensions, or check them if they are packed already.
 
     Raises:
         InputError: what `pack_bits` and `as_bits` raise.
@@ -73,18 +73,18 @@ def _packed(array: np.ndarray, name: str, length: int | None = None) -> Bits:
 
 
 def check_packable(length: int, name: str) -> None:
-    """Raise InputError where descriptors of so many numbers do not fill whole bytes."""
+    """Raise InputError if descriptors of this many dimensions do not fill whole bytes."""
     require(length % 8 == 0, f"{name}: found {length} numbers, expected a multiple of 8 as bits")
 
 
 def sign_vectors(bits: Bits) -> Float32[np.ndarray, "n d"]:
-    """Unpack bits to unit vectors of numbers of one size, whose cosines are the similarities."""
+    """Unpack bits to unit vectors with values of one size, whose cosines are the similarities."""
     size = np.float32(1 / np.sqrt(8 * bits.shape[1]))
     return np.where(np.unpackbits(bits, axis=1), size, -size)
 
 
 def as_bits(array: np.ndarray, name: str, length: int | None = None) -> Bits:
-    """Check that an array holds packed bits, of descriptors of `length` numbers if that is given.
+    """Check that an array holds packed bits, of descriptors of `length` dimensions if given.
 
     Raises:
         InputError: it is not a matrix of bytes, is empty, or is of another length.
@@ -101,10 +101,10 @@ def as_bits(array: np.ndarray, name: str, length: int | None = None) -> Bits:
 
 
 def search_bits(database: Bits, queries: Bits, k: int) -> Neighbours:
-    """Find the rows with the most equal bits of each query, exactly; see `retrieval.search`.
+    """Find the rows with the most bits in common with each query; see `retrieval.search`.
 
     Raises:
-        InputError: arrays that are not packed bits of one length.
+        InputError: arrays that are not packed bits of the same length.
     """
     database = as_bits(database, "database")
     queries = as_bits(queries, "queries", 8 * database.shape[1])
@@ -112,7 +112,7 @@ def search_bits(database: Bits, queries: Bits, k: int) -> Neighbours:
 
 
 def nearest_bits(database: Iterable[Bits], queries: Bits, k: int) -> Neighbours:
-    """Find the k rows with the most equal bits of each query; of as equal ones the lower indices.
+    """Find the k rows with the most bits in common with each query; ties go to lower indices.
 
     Args:
         database: packed bits, part by part, at least k rows in all.
@@ -120,8 +120,8 @@ def nearest_bits(database: Iterable[Bits], queries: Bits, k: int) -> Neighbours:
         k: neighbours per query.
 
     Returns:
-        Their similarities are 1 - 2 h / d, where h of the d bits differ: the cosines of the vectors
-        of signs.
+        The neighbours, with similarities 1 - 2 h / d, where h of the d bits differ: the cosines of
+        the sign vectors.
     """
     compared = _compared(regrouped(database, _ROWS), _as_words(queries), 8 * queries.shape[1])
     return best_products(compared, len(queries), k)
@@ -130,7 +130,7 @@ def nearest_bits(database: Iterable[Bits], queries: Bits, k: int) -> Neighbours:
 def _compared(
     stream: Iterable[Block], queries: np.ndarray, bits: int
 ) -> Generator[Products, None, None]:
-    """Yield the similarities of all queries and all blocks."""
+    """Yield the similarities of all queries to all blocks."""
     similarities = (1 - 2 * np.arange(bits + 1) / bits).astype(np.float32)
     for block in stream:
         rows = np.ascontiguousarray(_as_words(block.rows).T)
@@ -149,7 +149,7 @@ def _compared(
 
 
 def _as_words(bits: Bits) -> np.ndarray:
-    """View bits as numbers of 64; bytes that are missing are 0 on all sides."""
+    """View bits as 64-bit integers; missing bytes are padded with 0."""
     missing = -bits.shape[1] % 8
     padded = np.pad(bits, ((0, 0), (0, missing))) if missing else np.ascontiguousarray(bits)
     return padded.view(np.uint64)

@@ -1,4 +1,4 @@
-"""Descriptors in any number, in memory or on disk, some rows at a time."""
+"""Read any number of descriptors, in memory or on disk, some rows at a time."""
 
 import mmap
 from collections.abc import Generator, Iterable, Sequence
@@ -11,25 +11,25 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float32, Int
 
 Descriptors = Float[np.ndarray, "n d"]
-"""Descriptors of n images, a row of d numbers each."""
+"""Descriptors of n images, one row of d dimensions each."""
 Queries = Float32[np.ndarray, "q d"]
 """Unit descriptors of q images, in float32."""
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 UNIT_TOLERANCE = 1e-2
 WIDE = np.dtype(np.float32)
 BITS = np.dtype(np.uint8)
-"""Type of packed bits (`retrieval.bits`), which no other descriptors have."""
+"""Type of packed bits (`retrieval.bits`); no other descriptors have it."""
 _NARROW = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
 _NEIGHBOURS = 2**21
-"""Bytes around a page that is read which Linux maps with it, at most."""
+"""Maximum number of bytes around a page that Linux maps when it reads the page."""
 _SCATTERED = 4
-"""Number of scattered rows that are read before their pages are released."""
+"""Number of scattered rows read before their pages are released."""
 
 
 def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descriptors:
-    """Check that an array is a matrix of descriptors, of a length if that is given, and view it so.
+    """View an array as a matrix of descriptors, after checking it, and its length if given.
 
-    Numpy has no name for bfloat16: a .npy file holds it as two bytes without a type ("V2").
+    NumPy has no name for bfloat16: a .npy file stores it as two untyped bytes ("V2").
 
     Raises:
         InputError: the array is not a matrix of real numbers, is empty, or is of another length.
@@ -50,7 +50,7 @@ def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descript
 
 
 def as_unit_rows(array: np.ndarray, name: str, length: int | None = None) -> Queries:
-    """Check that an array is a matrix of unit descriptors, and return them in float32.
+    """Check that an array is a matrix of unit descriptors, and return it in float32.
 
     Raises:
         InputError: what `as_rows` and `check_rows` raise.
@@ -61,7 +61,7 @@ def as_unit_rows(array: np.ndarray, name: str, length: int | None = None) -> Que
 
 
 def as_sides(database: np.ndarray, queries: np.ndarray) -> tuple[Descriptors, Descriptors]:
-    """Check that database and queries are matrices of descriptors of one length.
+    """Check that database and queries are matrices of descriptors of the same length.
 
     Raises:
         InputError: what `as_rows` raises.
@@ -76,7 +76,7 @@ class Block(NamedTuple):
     start: int
     """Number of rows in the blocks before it."""
     rows: Float[np.ndarray, "size d"]
-    """In float32, unless asked for otherwise."""
+    """In float32, unless requested otherwise."""
 
 
 def blocks(
@@ -88,21 +88,21 @@ def blocks(
     places: Int[np.ndarray, " m"] | None = None,
     narrow: bool = False,
 ) -> Generator[Block, None, None]:
-    """Yield an array's rows in order, `size` at a time, checked, and without a copy if possible.
+    """Yield the rows of an array in order, `size` at a time, checked, and if possible uncopied.
 
-    Pages of a memory map are released after the block behind theirs is taken, so that a stream may
-    be read one block ahead.
+    Pages of a memory map are released after the next block is taken, so a stream may be read one
+    block ahead.
 
     Args:
         array: descriptors in memory or on disk.
-        name: what messages call it.
+        name: name of the array in messages.
         size: number of rows in a block; the last may have fewer.
-        unit: whether rows have to be of unit length, or only finite.
+        unit: whether rows must be of unit length, or only finite.
         places: the rows to yield, in ascending order; None for all.
         narrow: whether to leave float16 and bfloat16 as they are; other types become float32.
 
     Raises:
-        InputError: a row is not finite, or not of unit length where that is asked for.
+        InputError: a row is not finite, or not of unit length if required.
     """
     numbers = range(len(array)) if places is None else places
     before = array[:0]
@@ -119,7 +119,7 @@ def blocks(
 
 
 def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
-    """Join consecutive blocks to blocks of about `size` rows, at most twice as many.
+    """Join consecutive blocks into blocks of about `size` rows, at most twice as many.
 
     Args:
         stream: blocks of at most `size` rows.
@@ -138,7 +138,7 @@ def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
 
 
 def regrouped(parts: Iterable[Descriptors], size: int) -> Generator[Block, None, None]:
-    """Split and join consecutive arrays to blocks of about `size` rows, at most twice as many."""
+    """Regroup consecutive arrays into blocks of about `size` rows, at most twice as many."""
     pieces = (
         Block(0, part[start : start + size])  # `joined` counts
         for part in parts
@@ -148,7 +148,7 @@ def regrouped(parts: Iterable[Descriptors], size: int) -> Generator[Block, None,
 
 
 def gathered(array: Descriptors, places: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m d"]:
-    """Read the rows at some places in ascending order, and release their pages."""
+    """Read the rows at `places`, in ascending order, and release their pages."""
     parts = []
     for start in range(0, len(places), _SCATTERED):
         some = places[start : start + _SCATTERED]
@@ -158,28 +158,28 @@ def gathered(array: Descriptors, places: Int[np.ndarray, " m"]) -> Float[np.ndar
 
 
 def _widened(rows: np.ndarray) -> Float32[np.ndarray, "rows d"]:
-    with np.errstate(over="ignore"):  # what overflows is reported
+    with np.errstate(over="ignore"):  # overflow is reported later
         return rows.astype(WIDE, copy=False)
 
 
 def sample(total: int, count: int, seed: int) -> Int[np.ndarray, " count"]:
-    """Draw `count` of `total` places at random, sorted so that a disk is read in order."""
+    """Draw `count` of `total` places at random, sorted so that disks are read in order."""
     return np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
 
 
 def check_rows(
     rows: Float[np.ndarray, "rows d"], name: str, places: Sequence[int] | np.ndarray, *, unit: bool
 ) -> None:
-    """Check that rows are finite and, where that is asked for, unit vectors.
+    """Check that rows are finite and, if required, unit vectors.
 
     Args:
         rows: descriptors.
         name: where they are from.
         places: their indices there, for the message.
-        unit: whether they have to be of unit length, or only finite.
+        unit: whether they must be of unit length, or only finite.
 
     Raises:
-        InputError: a row is not; the message names the first.
+        InputError: a row is not; the message gives the first.
     """
     wide = _widened(rows)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -198,17 +198,17 @@ def check_rows(
 
 
 def _let_go(rows: np.ndarray) -> None:
-    """Release a memory map's pages; otherwise every page that was read stays in memory."""
+    """Release the pages of a memory map; otherwise every page that was read stays in memory."""
     owner: Any = rows
     while isinstance(owner.base, np.ndarray):
         owner = owner.base
-    # Pages written in a copy-on-write map exist in memory alone: releasing them would lose them.
+    # Pages written in a copy-on-write map exist only in memory: releasing them would lose them.
     is_file = isinstance(owner, np.memmap) and owner.mode != "c"
     if not is_file or not len(rows) or not hasattr(mmap, "MADV_DONTNEED"):
         return
     mapping: Any = owner.base
     origin = np.frombuffer(mapping, np.uint8).ctypes.data
     first, end = (place - origin for place in np.lib.array_utils.byte_bounds(rows))
-    # Reading the first page has mapped its neighbours again, which the last call had released.
+    # Reading the first page has mapped its neighbours again, which the last call released.
     first = max(0, first - first % mmap.PAGESIZE - _NEIGHBOURS)
     mapping.madvise(mmap.MADV_DONTNEED, first, end - first)

@@ -1,6 +1,6 @@
-"""Descriptors of images: each independently, with the frames before it, or in groups.
+"""Describe images: each independently, with the frames before it, or in groups.
 
-Nothing here imports JAX: what computes is a `Describer`.
+Nothing here imports JAX: the computation is in a `Describer`.
 """
 
 import os
@@ -44,19 +44,19 @@ class Described(NamedTuple):
 
 
 def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image") -> Pixels:
-    """Resize an image as a model's configuration says, and normalise floats.
+    """Resize an image according to the configuration of a model, and normalise floats.
 
     Args:
-        image: 8-bit RGB, of `read_image`; or grey (height, width) or (height, width, 1), which is
-            repeated over the channels; or uint16, of which the configuration makes 8 bits.
+        image: 8-bit RGB, from `read_image`; or grey (height, width) or (height, width, 1), which is
+            repeated over the channels; or uint16, which the configuration converts to 8 bits.
         config: the model's configuration.
         name: name of the image, for messages.
 
     Returns:
-        What `describe` takes, in a batch: 8-bit pixels, or normalised float32.
+        An image for a batch of `describe`: 8-bit pixels, or normalised float32.
 
     Raises:
-        InputError: the image is not such an array, or the model cannot describe one of its size.
+        InputError: the image is not such an array, or the model cannot describe this size.
 
     Example:
         >>> import numpy as np
@@ -70,7 +70,7 @@ def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image")
 
 
 def _as_list(name: str, given: Any) -> list[Any]:
-    """Return what was given, a file or a list, as a list.
+    """Return a file or a list of images as a list.
 
     Raises:
         InputError: it is neither, or an empty list.
@@ -83,7 +83,7 @@ def _as_list(name: str, given: Any) -> list[Any]:
 
 
 def check_readable(source: object, tried: int, readable: int) -> None:
-    """Raise InputError where none of a source's images could be read."""
+    """Raise InputError if none of the images of a source could be read."""
     require(readable > 0, f"{source}: found {tried} images, none of them readable")
 
 
@@ -94,8 +94,8 @@ def describe_files(
 ) -> Float32[np.ndarray, "image descriptor"]:
     """Describe image files, each independently of the others.
 
-    Files are decoded upright and resized as the model's configuration says, which is all that a
-    descriptor depends on. `extract` does the same for folders, and writes files.
+    Files are decoded upright and resized according to the model's configuration; a descriptor
+    depends on nothing else. `extract` does the same for folders, and writes files.
 
     Args:
         model: parameters and configuration, as `load` returns them, or a `Runtime`.
@@ -106,7 +106,7 @@ def describe_files(
         A descriptor of each readable file, in order.
 
     Raises:
-        InputError: no files, one that cannot be read, or parameters that are not of the
+        InputError: no files, one that cannot be read, or parameters that do not match the
             configuration.
 
     Example:
@@ -129,20 +129,20 @@ def describe_images(
 ) -> Float32[np.ndarray, "image descriptor"]:
     """Describe images in memory, each independently of the others.
 
-    A batch is padded to a power of two, so that few programs are compiled, and a single image costs
-    one. The values differ from those of `describe_files` by the rounding of other batch sizes.
+    A batch is padded to a power of two, so that few programs are compiled and a single image costs
+    one. Values differ from those of `describe_files` by rounding, as batch sizes differ.
 
     Args:
         model: parameters and configuration, as `load` returns them, or a `Runtime`.
         images: 8-bit RGB, of any sizes, as `read_image` returns them, or grey; see
             `prepare_image`.
-        batch_size: largest number of images described together.
+        batch_size: maximum number of images described together.
 
     Returns:
         A descriptor of each image, in order.
 
     Raises:
-        InputError: no images, or one that `prepare_image` does not take or that the model cannot
+        InputError: no images, or one that `prepare_image` does not accept or that the model cannot
             describe.
 
     Example:
@@ -162,7 +162,7 @@ def describe_images(
 def describe_prepared(
     describer: Describer, prepared: Sequence[Pixels], batch_size: int
 ) -> Float32[np.ndarray, "image descriptor"]:
-    """Describe images of `prepare_image`, each independently; see `describe_images`."""
+    """Describe images from `prepare_image`, each independently; see `describe_images`."""
     by_shape: dict[tuple[int, ...], list[int]] = {}
     for number, image in enumerate(prepared):
         by_shape.setdefault(image.shape, []).append(number)
@@ -184,7 +184,7 @@ def describe_prepared(
 
 
 def _alone(describer: Describer, rows: Rows) -> Float[np.ndarray, "image descriptor"]:
-    """Make the descriptors of images that attend to themselves alone."""
+    """Compute the descriptors of images that attend only to themselves."""
     return describer.attend(rows[None], np.eye(len(rows), dtype=bool)[None])[0]
 
 
@@ -198,10 +198,10 @@ def described(
 ) -> Iterator[Described]:
     """Describe images in order, each with the `window - 1` before it, and yield batch by batch.
 
-    The descriptors are those of the grouping `window`, or `single` where the window is 1, of the
-    images that could be read. Two batches are in memory, and the images that are read ahead.
-    Components shorten whole batches, so that the bits of a descriptor do not depend on which others
-    could be read.
+    The descriptors are those of the grouping `window`, or `single` if the window is 1, of the
+    images that could be read. Memory holds two batches, and the images that are read ahead.
+    Components reduce whole batches, so that the bits of a descriptor do not depend on which other
+    images could be read.
 
     Raises:
         InputError: an image cannot be read and `reading` says "stop"; or what
@@ -221,7 +221,7 @@ def described(
 def token_rows(
     describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
 ) -> Iterator[Described]:
-    """Yield the tokens of images in order, batch by batch, in the place of descriptors.
+    """Yield the tokens of images in order, batch by batch, in place of descriptors.
 
     Raises:
         InputError: an image cannot be read and `reading` says "stop".
@@ -235,7 +235,7 @@ def _each_batch(
     reading: Reading,
     describe: Callable[[Rows, Bool[np.ndarray, " image"]], Rows],
 ) -> Iterator[Described]:
-    """Yield what is made of each batch's tokens, padding included, and of which are valid."""
+    """Apply `describe` to the tokens of each batch, padding included, and yield the results."""
     batches = reading.batches(paths, describer.preparation)
     for rows, batch in describer.tokens(batches):
         unreadable = batch.indices[(batch.indices >= 0) & ~batch.valid]
@@ -245,7 +245,7 @@ def _each_batch(
 def shown(
     stream: Iterator[Described], label: str, total: int, *, quiet: bool, done: int = 0
 ) -> Iterator[Described]:
-    """Pass descriptors on, and show in a progress bar how many of the images are done."""
+    """Pass descriptors through, and show the number of finished images in a progress bar."""
     with progress_bar(label, total, "images", quiet=quiet, done=done) as bar:
         for part in stream:
             yield part
@@ -278,7 +278,7 @@ def readable(
         stream: descriptors.
         size: number of descriptors to join.
         items: of all images, such as their names.
-        unreadable: gets the items of the other images.
+        unreadable: the items of the other images are appended to it.
     """
     for part in joined(stream, size):
         unreadable.extend(items[index] for index in part.unreadable)
@@ -296,7 +296,7 @@ class TokenSet:
         reading: Reading,
         label: str = "images",
     ) -> None:
-        """Read the images, as `token_rows`."""
+        """Read the images, as in `token_rows`."""
         stream = token_rows(describer, paths, reading)
         stream = shown(stream, label, len(paths), quiet=reading.quiet)
         _, self.rows, self.unreadable = concatenated(list(stream))
@@ -316,7 +316,7 @@ class TokenSet:
 def group(
     describer: Describer, rows: Rows, batches: Batches, **options: Any
 ) -> Float[np.ndarray, "image descriptor"]:
-    """Describe images, in their order, in batches; options are those of `grouped`."""
+    """Describe images in batches, and return them in order; options are those of `grouped`."""
     descriptors = np.empty((len(rows), describer.config.descriptor_dim), np.float32)
     for images, found in grouped(describer, rows, batches, **options):
         descriptors[images] = found
@@ -332,26 +332,26 @@ def grouped(
     label: str = "images",
     quiet: bool = True,
 ) -> Iterator[tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n descriptor"]]]:
-    """Yield the descriptors of images in batches, some at a time, with the images' numbers.
+    """Yield the indices and descriptors of images in batches, some at a time.
 
     Args:
         describer: the model.
-        rows: the images' tokens, by number.
+        rows: the tokens of the images, by index.
         batches: which images attend to each other.
-        first: the first batch that is described.
+        first: the first batch to describe.
         label: label of the progress bar.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
     """
     count, size = batches.images.shape
-    # A batch that gives one descriptor is computed with as many others as it has images.
+    # Batches that give one descriptor are computed together, as many as each has images.
     gives_one = batches.grouping in ("window", MASKED)
     step = max(1, min(size, count - first)) if gives_one else 1
-    # The other groupings take little time compared with the backbone: they need no bar.
+    # The other groupings take little time compared with the backbone, and need no bar.
     silent = quiet or not gives_one
     with progress_bar(f"{label}, {batches.grouping}", count, "images", quiet=silent) as bar:
         for start in range(first, count, step):
             part = batches.part(start, start + step)
-            # The last groups are repeated, so that all steps run one program.
+            # Groups are repeated in the last step, so that all steps run the same program.
             groups = np.resize(np.arange(len(part.images)), step)
             distinct, places = np.unique(part.images, return_inverse=True)
             tokens = rows[distinct][places.reshape(part.images.shape)[groups]]
@@ -361,13 +361,13 @@ def grouped(
 
 
 class FrameDescriber:
-    """Describe images as they come, each with the `window - 1` before it."""
+    """Describe images as they arrive, each with the `window - 1` before it."""
 
     def __init__(self, describer: Describer, window: int = 1) -> None:
         """Start without an image.
 
         Raises:
-            InputError: the window is below 1, or above with a model whose images do not attend to
+            InputError: the window is below 1, or above 1 for a model whose images do not attend to
                 each other.
         """
         # An engine's configuration needs JAX, which takes a second to import.
@@ -390,7 +390,7 @@ class FrameDescriber:
         return self.of_tokens(rows)
 
     def of_tokens(self, rows: Rows) -> Float32[np.ndarray, "n d"]:
-        """Describe the next images, of which these are the tokens."""
+        """Describe the next images, given their tokens."""
         held = np.concatenate([*self._before, rows])
         first = len(held) - len(rows)
         self._before = [held[max(0, len(held) - self._window + 1) :]]

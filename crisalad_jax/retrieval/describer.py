@@ -1,6 +1,6 @@
-"""What describes images: a model in JAX or in another engine, behind one interface.
+"""One interface to models that describe images, in JAX or in another engine.
 
-Nothing here imports JAX: `jax_describer` does, where a model of JAX's is given.
+Nothing here imports JAX: `jax_describer` does, if a JAX model is given.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,11 +19,11 @@ if TYPE_CHECKING:  # an engine describes images without JAX
     from crisalad_jax.nn.model import Model
 
 Rows = Float[np.ndarray, "image token_numbers"]
-"""The tokens of some images, a row of numbers each, which only the describer's `attend` reads."""
+"""The tokens of some images, one row each, which only the describer's `attend` reads."""
 
 
 class Describer(Protocol):
-    """A model that describes images in two steps: every image's tokens, then their descriptors."""
+    """A model that describes images in two steps: the tokens of each, then their descriptors."""
 
     config: "ModelConfig"
     """The model's configuration."""
@@ -45,9 +45,9 @@ class Describer(Protocol):
         rows: Float[np.ndarray, "group image row"],
         mask: Bool[np.ndarray, "group image image"],
     ) -> Float[np.ndarray, "group image descriptor"]:
-        """Make descriptors of the tokens of some groups of images.
+        """Compute descriptors from the tokens of groups of images.
 
-        `mask[g, i, j]` allows image i of group g to attend to image j of it.
+        `mask[g, i, j]` allows image i of group g to attend to image j of the same group.
         """
         ...
 
@@ -55,14 +55,14 @@ class Describer(Protocol):
 def describer_of(
     model: "Model | Runtime | Describer", groupings: Sequence[str] = ("single",)
 ) -> Describer:
-    """Return what describes images with a model, and check it.
+    """Return a describer for a model, and check it.
 
     Args:
         model: parameters and configuration, or a model in another engine.
-        groupings: the groupings of images that it has to describe, each as `Grouping.parse` takes.
+        groupings: the groupings that it must support, each as `Grouping.parse` takes it.
 
     Raises:
-        InputError: the parameters are not of the configuration; or the engine's program is for
+        InputError: the parameters do not match the configuration; or the engine's program is for
             other groupings.
     """
     if isinstance(model, Runtime):

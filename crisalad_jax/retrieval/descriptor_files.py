@@ -3,7 +3,7 @@
 d.npy          a row for each image
 d.names.txt    a line for each image
 d.npy.json     how they were made, and the digests of the files that belong together
-d.h5           a group for each image; d.h5.json beside it
+d.h5           a group for each image; d.h5.json is next to it
 """
 
 import contextlib
@@ -34,25 +34,25 @@ from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.shapes import Float, Int
 
 _DIGESTS = "files"
-"""Key of the digests in the record, by the files' roles."""
+"""Key of the digests in the record, by the roles of the files."""
 MADE_BY = "model_sha256"
 """Key of the `model_hash` in the record of descriptors that this package made."""
 _SUFFIXES = (".npy", ".h5")
 
 
 def record_of(path: pathlib.Path) -> pathlib.Path:
-    """Return the path of the JSON file that tells how the descriptors in `path` were made."""
+    """Return the path of the JSON file that records how the descriptors in `path` were made."""
     return path.with_name(f"{path.name}.json")
 
 
 def read_record(path: pathlib.Path) -> dict[str, Any]:
-    """Read how the descriptors in `path` were made; nothing where they have no record."""
+    """Read how the descriptors in `path` were made; return {} if they have no record."""
     record = record_of(path)
     return read_json(record, "a record of descriptors") if record.is_file() else {}
 
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:
-    """List all files that a set of descriptors in `path` consists of.
+    """List all files of a set of descriptors in `path`.
 
     Raises:
         InputError: the suffix is neither .npy nor .h5.
@@ -76,22 +76,22 @@ def write_descriptors(
     within: pathlib.Path | None = None,
     written: pathlib.Path | None = None,
 ) -> None:
-    """Write descriptors, their images' names and a record of both.
+    """Write descriptors, the names of their images and a record of both.
 
-    All files are written whole under temporary names. Then the record gets its name, and the others
-    theirs. A process that is killed in between leaves a set whose digests differ from its record,
-    and `read_descriptors` refuses that.
+    All files are written completely under temporary names. Then the record is renamed, and after it
+    the others. A process killed in between leaves a set whose digests differ from its record, which
+    `read_descriptors` refuses.
 
     Args:
-        path: a file .npy or .h5.
+        path: a .npy or .h5 file.
         descriptors: a row for each image.
         names: of the images.
         record: how they were made, as JSON values.
         within: a folder for temporary files, see `files.atomic_path`.
-        written: a .npy file of the descriptors on the same disk, which may be moved, not copied.
+        written: a .npy file of the descriptors on the same disk, to be moved instead of copied.
 
     Raises:
-        InputError: another suffix, a name twice in a .h5, or a file that cannot be written.
+        InputError: another suffix, a repeated name in a .h5, or a file that cannot be written.
     """
     path = pathlib.Path(path)
     targets(path)
@@ -118,9 +118,9 @@ def write_rows(
     shape: tuple[int, int],
     parts: Iterable[tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n descriptor"]]],
 ) -> None:
-    """Write a .npy file of float32 rows, which come in any order, some at a time.
+    """Write a .npy file of float32 rows, which arrive in any order, some at a time.
 
-    A memory map would end the process where the disk gets full; this raises OSError.
+    With a memory map, a full disk would kill the process; this raises OSError.
 
     Args:
         path: the file.
@@ -155,7 +155,7 @@ def _write_h5(
 
 
 class _NeverFull(io.FileIO):
-    """A file that keeps the first error of the disk to itself: HDF5 would crash the process."""
+    """A file that stores the first disk error instead of raising it: HDF5 would crash on it."""
 
     error: OSError | None = None
 
@@ -183,8 +183,8 @@ def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptor
         verify: whether to read the file, and compare it with the digest in its record.
 
     Raises:
-        InputError: there is no such file, it holds no matrix of such numbers, or other bytes than
-            its record says.
+        InputError: the file does not exist, does not hold a matrix of such numbers, or does not
+            match its record.
     """
     path = pathlib.Path(path)
     check_source(path, "a .npy file of descriptors")
@@ -192,7 +192,7 @@ def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptor
         _check_files(path, ["descriptors"])
     try:
         array = np.lib.format.open_memmap(path, mode="r")
-    except Exception as error:  # numpy's parser of headers raises errors of many kinds
+    except Exception as error:  # numpy's header parser raises errors of many kinds
         raise InputError(f"{path}: not a whole .npy file: {one_line(error)}") from error
     if array.dtype.kind != "f" and array.dtype != np.dtype("V2"):
         raise InputError(
@@ -204,18 +204,18 @@ def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptor
 def read_descriptors(
     path: str | os.PathLike[str], *, verify: bool = True
 ) -> tuple[list[str], Descriptors]:
-    """Read names and descriptors from a file of `write_descriptors` or of hloc, of any float type.
+    """Read names and descriptors of any float type, from `write_descriptors` or hloc.
 
-    A .npy file is memory-mapped: its rows are read when they are used. A note tells of a set
-    without a record of its digests.
+    A .npy file is memory-mapped: its rows are read when they are used. A note reports a set without
+    a record of its digests.
 
     Args:
         path: the file.
         verify: whether to read the files, and compare them with their digests.
 
     Raises:
-        InputError: the file, or the names beside a .npy, is missing, not whole, of another set, or
-            holds something else.
+        InputError: the file, or the names next to a .npy, is missing, incomplete, from another set,
+            or holds something else.
     """
     path = pathlib.Path(path)
     readers = {".npy": _read_npy, ".h5": _read_h5}
@@ -265,7 +265,7 @@ def _read_h5(path: pathlib.Path) -> tuple[list[str], Descriptors]:
             file.visit(found.append)
             found = [name for name in found if name.endswith("/global_descriptor")]
             rows: Any = np.stack([file[name][()] for name in found])  # pyright: ignore
-    except Exception as error:  # damaged files end in errors of many kinds
+    except Exception as error:  # damaged files raise errors of many kinds
         reason = one_line(error)
         raise InputError(f"{path}: not a whole HDF5 file of descriptors: {reason}") from error
     return [name.removesuffix("/global_descriptor") for name in found], as_rows(rows, str(path))

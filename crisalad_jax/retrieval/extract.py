@@ -66,7 +66,7 @@ class Extracted(NamedTuple):
     names: list[str]
     """Names of the images that could be read, in order."""
     descriptors: Descriptors
-    """Their descriptors, float32; a memory map where they are in a file."""
+    """Their descriptors, float32; a memory map if they are in a file."""
     skipped: list[str]
     """Names of the images that could not be read."""
 
@@ -89,41 +89,40 @@ def extract(
     reading: Reading = Reading(),
     cluster: str | None = None,
 ) -> Extracted:
-    """Describe images, and write the descriptors where they are asked for.
+    """Describe images, and write the descriptors to `out` if it is given.
 
-    With `out`, the same call resumes after a kill, and one process at a time may write there.
-    Tokens and descriptors are in files meanwhile, and a few hundred images' in memory.
+    With `out`, repeating a killed call resumes it, and only one process at a time may write there.
+    Tokens and descriptors are stored in files meanwhile; memory holds a few hundred images' worth.
 
     Args:
         model: parameters and configuration, as `load` returns them, or a `Runtime`.
         images: a folder, searched with its subfolders in sorted order, another source of images
             (docs/how-to/image-sources.md), or a list of files.
-        out: a file .npy, with the names in another, or .h5, as hloc reads it. How it was made is
-            written next to it, as JSON. None writes nothing.
-        fps: frames a second taken of a video or log, which is then expected; None is one.
-        topic: the topic of images in a robot log; None is the only one.
-        positions: where images were taken, for `every_metres`, as `index` takes it.
-        every_metres: least distance of an image from the last one of its folder or video that was
-            taken, as of `index`. None takes all.
-        weights: the file that the parameters are from, for that JSON and for messages.
+        out: a .npy file, with the names in a second file, or an .h5 file as hloc reads it. A JSON
+            file next to it records how it was made. None writes nothing.
+        fps: frames per second taken from a video or log, which is then required; None is one.
+        topic: the image topic of a robot log; None uses the only one.
+        positions: where images were taken, for `every_metres`, as in `index`.
+        every_metres: minimum distance of an image from the last selected one of its folder or
+            video, as in `index`. None selects all.
+        weights: the file of the parameters, for the JSON file and for messages.
         grouping: one of `GROUPINGS`: which images attend to each other.
-        seed: draws the order of the grouping "shuffled".
-        root: folder that names are relative to. By default it is the folder `images`, or that of
-            another source; files of a list keep their names.
-        pca: components that shorten the descriptors, or a file of them.
-        verify: whether to check the bytes of `pca` against their checksum.
+        seed: random seed of the order in the grouping "shuffled".
+        root: folder that names are relative to; by default the folder `images`, or that of another
+            source. Files of a list keep their names.
+        pca: components that reduce the descriptors, or a file of them.
+        verify: whether to check `pca` against its checksum.
         reading: how images are read.
         cluster: the Ray cluster that describes them (extra `ray`): "local", "auto",
-            "ray://HOST[:PORT]" or "HOST:PORT" (docs/how-to/ray.md). None describes them here.
+            "ray://HOST[:PORT]" or "HOST:PORT" (docs/how-to/ray.md). None uses this process.
 
     Returns:
         Names and descriptors of the images that could be read.
 
     Raises:
         InputError: what `describer_of`, `check_extraction` and `connected` raise; components of
-            another length; no image, an image that cannot be read, or none that can; a name that is
-            not a line of text or does not lie under `root`; or a file that cannot be read or
-            written.
+            another length; no images, an unreadable image, or no readable one; a name that is not a
+            line of text or is not under `root`; or a file that cannot be read or written.
 
     Example:
         >>> import jax
@@ -181,16 +180,16 @@ def extract(
 
 
 def check_extraction(out: StrPath | None, *, grouping: str, seed: int, cluster: str | None) -> None:
-    """Check what can be checked of an extraction before a model is loaded.
+    """Check the arguments of an extraction before a model is loaded.
 
     Args:
-        out: as `extract` takes it, and so are the others.
+        out: as in `extract`, like the others.
         grouping: which images attend to each other.
-        seed: draws the order of the grouping "shuffled".
+        seed: random seed of the order in the grouping "shuffled".
         cluster: the address of a Ray cluster.
 
     Raises:
-        InputError: an unknown suffix or grouping; a file that cannot be made; or a number out of
+        InputError: an unknown suffix or grouping; a file that cannot be created; or a number out of
             range.
 
     Example:
@@ -205,9 +204,9 @@ def check_extraction(out: StrPath | None, *, grouping: str, seed: int, cluster: 
 
 @dataclasses.dataclass(frozen=True)
 class _Work:
-    """What describes the images of an extraction, and stores their rows as it goes.
+    """The work of an extraction: to describe images and store their rows step by step.
 
-    The rows are descriptors where every image is described independently, else tokens.
+    The rows are descriptors if every image is described independently, and tokens otherwise.
     """
 
     describer: Describer
@@ -221,7 +220,7 @@ class _Work:
     seed: int
     reading: Reading
     label: str
-    """What messages call the descriptors."""
+    """Name of the descriptors in messages."""
     paths: Sequence[pathlib.Path]
     names: Sequence[str]
 
@@ -266,7 +265,7 @@ class _Work:
         return segments, skipped
 
     def _reusable(self, folder: pathlib.Path, digest: str) -> Segments:
-        """Open the stored rows if they are whole and of this work; else remove them."""
+        """Open the stored rows if they are complete and from this work; otherwise remove them."""
         try:
             segments = self.opened(folder)
             segments.verify()
@@ -280,7 +279,7 @@ class _Work:
         return self.opened(folder)
 
     def _digest(self) -> str:
-        """Compute a digest of what rows depend on, and of the names, sizes and times of files."""
+        """Compute a digest of all settings that affect rows, and of file names, sizes and times."""
         settings = {
             **_made(self.describer, self.components),
             "config": to_plain(self.describer.config),
@@ -294,7 +293,7 @@ class _Work:
         return digest_of(files, settings)
 
     def descriptors(self, stored: Segments) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield the descriptors of stored rows, some at a time, with their numbers."""
+        """Yield the indices and descriptors of stored rows, some at a time."""
         if self.grouping == "single":
             for span, block in zip(stored.spans, stored.blocks(), strict=True):
                 yield np.arange(span.first, span.first + span.count), block
@@ -308,13 +307,13 @@ class _Work:
 
 @contextlib.contextmanager
 def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
-    """Hold the folder of what is done of the descriptors in `out`; remove it after success.
+    """Hold the folder of unfinished descriptors of `out`; remove it after success.
 
-    An error leaves it only if it holds work: the message then says so. Without `out` the folder is
-    a temporary one.
+    An error leaves it only if it holds work, and the message then says so. Without `out`, the
+    folder is temporary.
 
     Raises:
-        InputError: another process writes these descriptors, or the folder cannot be made.
+        InputError: another process is writing these descriptors, or the folder cannot be created.
     """
     if out is None:
         with tempfile.TemporaryDirectory(prefix="crisalad-") as temporary:
@@ -335,7 +334,7 @@ def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
                 ) from error
             raise
         _remove_work(folder)
-    with contextlib.suppress(OSError):  # another process has begun here, or a user's file is there
+    with contextlib.suppress(OSError):  # another process has started, or it holds a user's file
         folder.rmdir()
 
 
@@ -371,7 +370,7 @@ def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
 
 
 def _made(describer: Describer, components: Pca | None) -> dict[str, str | None]:
-    """Return the hashes that tell what made descriptors: compared ones share them."""
+    """Return the hashes of what made the descriptors; only equal ones can be compared."""
     return {
         MADE_BY: describer.digest,
         "pca_sha256": None if components is None else pca_hash(components),

@@ -1,10 +1,9 @@
-"""Approximate search by FAISS, for databases whose exact search takes too long.
+"""Approximate search with FAISS, for databases that are too large for exact search.
 
 A graph (HNSW: Malkov and Yashunin, 2018) stores the descriptors as they are and finds nearly all
-neighbours. IVF-RaBitQ (Gao and Long, 2024) stores a bit of each number, and compares the bits in
-the lists nearest to a query; exact similarities then rank what it finds. What either misses is
-measured against the exact search: `recall_against_exact`. Reduce descriptors of thousands of
-numbers first (`pca`).
+neighbours. IVF-RaBitQ (Gao and Long, 2024) stores one bit per dimension, and compares the bits in
+the lists nearest to a query; exact similarities then rank the results. `recall_against_exact`
+measures what either misses. Reduce descriptors of thousands of dimensions first (`pca`).
 """
 
 import hashlib
@@ -27,25 +26,25 @@ from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Int
 
-faiss: Any = _faiss  # its classes are made when it is loaded
+faiss: Any = _faiss  # its classes are created at import
 Kind = Literal["hnsw", "ivf-rabitq"]
 KINDS: dict[str, None] = dict.fromkeys(get_args(Kind))
-"""A graph over the descriptors as they are, nearly exact and as large as they are; or lists of
-their signs, a 27th of the size at 512 numbers, whose answers are to be ranked again."""
+"""A graph over the unchanged descriptors, nearly exact and as large as they are; or lists of their
+signs, a 27th of the size at 512 dimensions, whose results should be ranked again."""
 _LINKS = 32
-"""Number of links of a vector in each layer of the graph; twice as many in the lowest. Faiss
+"""Number of links of a vector in each layer of the graph; twice as many in the lowest. FAISS
 recommends 4 to 64 and the paper 5 to 48, with more for longer vectors."""
 _BUILD_EFFORT = 128
-"""Number of candidates kept while a vector is inserted; the paper's examples keep 100."""
+"""Number of candidates while a vector is inserted; the paper's examples use 100."""
 _LEAST_EFFORT = 128
-"""Number of candidates kept while a graph is searched, at least."""
+"""Minimum number of candidates while a graph is searched."""
 _LEAST_LISTS = 256
-"""Number of lists that a query looks into, at least."""
+"""Minimum number of lists that a query searches."""
 _PER_LIST = 39
-"""Number of vectors to train a list's centroid from; with fewer, faiss warns of a poor
+"""Number of vectors to train the centroid of a list from; with fewer, FAISS warns of a poor
 clustering."""
 _TRAINING_BYTES = 2**30
-"""Largest size in bytes of the descriptors that an index is trained from."""
+"""Maximum size in bytes of the descriptors that an index is trained on."""
 _CHUNK_BYTES = 2**26
 
 
@@ -54,7 +53,7 @@ class Index(NamedTuple):
 
     kind: Kind
     faiss_index: Any
-    """The index of faiss."""
+    """The FAISS index."""
 
     @property
     def size(self) -> int:
@@ -71,16 +70,16 @@ class Index(NamedTuple):
     ) -> Neighbours:
         """Find the most similar descriptors of each query, approximately.
 
-        Where fewer than k are found, the last indices are -1 and their similarities -inf. Those of
-        IVF-RaBitQ are estimates.
+        If fewer than k are found, the last indices are -1 and their similarities -inf. The
+        similarities of IVF-RaBitQ are estimates.
 
         Args:
             queries: unit descriptors.
             k: neighbours per query; at most all.
-            effort: how much is looked at, for more to be found in more time: of HNSW, candidates
-                kept while searching (by default 128, or 2 k); of IVF-RaBitQ, lists looked into (by
-                default a sixteenth of them, or 256).
-            without: indices that are not to be found; None is none.
+            effort: how much to search; more finds more and takes longer. For HNSW, the number of
+                candidates (the larger of 128 and 2 k by default); for IVF-RaBitQ, the number of
+                lists (the larger of 256 and a sixteenth of them by default).
+            without: indices to exclude; None excludes none.
 
         Raises:
             InputError: queries of another length, not finite or not of unit length; k or effort
@@ -113,7 +112,7 @@ class Index(NamedTuple):
 
         Args:
             parts: unit descriptors.
-            count: number of them all, for the progress bar.
+            count: total number of rows, for the progress bar.
             quiet: no progress bar.
 
         Raises:
@@ -125,33 +124,33 @@ class Index(NamedTuple):
                 bar.advance(len(part))
 
     def has_room_for(self, count: int) -> bool:
-        """Return whether a new index of so many descriptors has at most twice as many lists."""
+        """Return whether an index built for `count` descriptors has at most twice as many lists."""
         index = self.faiss_index
         return self.kind == "hnsw" or 2 * _lists(index).nlist >= _list_count(count, index.d)
 
 
 Parts = Callable[[], Iterable[Float[np.ndarray, "rows d"]]]
-"""Yields descriptors some rows at a time, each time that it is called."""
+"""Yields descriptors some rows at a time, each time it is called."""
 
 
 def build(kind: Kind, database: Descriptors | Parts, *, seed: int = 0, quiet: bool = True) -> Index:
     """Build an index of unit descriptors, which may be a memory map, reading some at a time.
 
-    IVF-RaBitQ rotates vectors by random signs and Hadamard matrices, so that no number of theirs
-    counts for more than others, and has 4 sqrt(n) lists (faiss's guidelines: 4 to 16 sqrt(n)), or
-    fewer, so that each is trained from 39 vectors. The training sample is random, 1 GiB of
-    descriptors at most. A descriptor takes a bit for each number, up to the next power of two, 8
-    bytes for two factors and 8 for its index.
+    IVF-RaBitQ rotates vectors by random signs and Hadamard matrices, so that no dimension counts
+    more than others. It has 4 sqrt(n) lists (the FAISS guidelines say 4 to 16 sqrt(n)), or fewer,
+    so that each is trained from 39 vectors. The training sample is random, at most 1 GiB of
+    descriptors. A descriptor takes one bit per dimension, rounded up to the next power of two, plus
+    8 bytes for two factors and 8 for its index.
 
-    HNSW has 32 links for each vector. Its graph, and so the few neighbours that it misses, depend
+    HNSW has 32 links per vector. Its graph, and therefore the few neighbours that it misses, depend
     on the order in which threads insert vectors. With one thread (OMP_NUM_THREADS=1) the graph
-    depends on the seed alone, as IVF-RaBitQ always does.
+    depends only on the seed, as IVF-RaBitQ always does.
 
     Args:
-        kind: of `KINDS`.
+        kind: one of `KINDS`.
         database: unit descriptors, as `retrieval.search` takes them; or a function that yields them
             in parts, which is called for each of up to three passes.
-        seed: of the clustering and its sample, or of the vectors' layers in the graph.
+        seed: of the clustering and its sample, or of the layers of vectors in the graph.
         quiet: no progress bar.
 
     Raises:
@@ -195,10 +194,10 @@ def _trained_lists(count: int, length: int, database: Parts, seed: int) -> Any:
     rotation = faiss.HadamardRotation(length, seed)
     bits = rotation.d_out
     lists = faiss.IndexIVFRaBitQ(faiss.IndexFlatIP(bits), bits, number, faiss.METRIC_INNER_PRODUCT)
-    # The centroids are unit vectors, for they are compared by inner products.
+    # The centroids are unit vectors, since they are compared by inner products.
     lists.cp.spherical = True
     lists.cp.seed = seed
-    lists.cp.min_points_per_centroid = 1  # or it warns of the single list of a few vectors
+    lists.cp.min_points_per_centroid = 1  # or it warns about a single list of a few vectors
     places = sample(count, min(count, _PER_LIST * number), seed)
     start, chosen = 0, []
     for part in database():
@@ -211,9 +210,9 @@ def _trained_lists(count: int, length: int, database: Parts, seed: int) -> Any:
 
 
 def save_index(path: str | os.PathLike[str], index: Index) -> None:
-    """Write an index in faiss's format with its checksum behind it, whole or not at all.
+    """Write an index in the FAISS format, followed by its checksum, atomically.
 
-    faiss itself reads the file too, and not as far as the checksum.
+    FAISS itself can read the file too; it stops before the checksum.
 
     Raises:
         InputError: the file cannot be written.
@@ -229,18 +228,18 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
 
 
 def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
-    """Read an index that `save_index` wrote; a note says so of one without a checksum.
+    """Read an index that `save_index` wrote; a note reports a missing checksum.
 
     Args:
         path: the file.
-        verify: whether to check that the file's bytes are those that were written.
+        verify: whether to check the file against its checksum.
 
     Raises:
-        InputError: there is no such file, it was changed, or it holds no index of `KINDS`.
+        InputError: the file does not exist, was changed, or does not hold an index of `KINDS`.
     """
     path = pathlib.Path(path)
     check_source(path, "a faiss index")
-    if verify and path.stat().st_size:  # no file is mapped without bytes
+    if verify and path.stat().st_size:  # an empty file cannot be mapped
         _check_appended(path)
     try:
         index = faiss.read_index(str(path))
@@ -264,8 +263,8 @@ def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "
     """Measure the share of the exact neighbours that a search found over all queries, 0 to 1.
 
     Args:
-        found: indices by an approximate search.
-        exact: those by `retrieval.search`.
+        found: indices from an approximate search.
+        exact: indices from `retrieval.search`.
 
     Raises:
         ValueError: the arrays differ in length.
@@ -275,15 +274,15 @@ def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "
 
 
 _APPENDED = b"\nsha256 "
-"""Begins a line with the digest of the bytes before it, where readers of the format stop."""
+"""Starts a line with the digest of the bytes before it; readers of the format stop before it."""
 _APPENDED_SIZE = len(_APPENDED) + 64 + 1
 
 
 def _check_appended(path: pathlib.Path) -> None:
-    """Check the digest that `save_index` appended; a note tells of a file without one.
+    """Check the digest that `save_index` appended; a note reports a file without one.
 
     Raises:
-        InputError: the file has other bytes than the line says.
+        InputError: the bytes of the file do not match the digest.
     """
     data = np.memmap(path, np.uint8, "r")
     line = data[-_APPENDED_SIZE:].tobytes()

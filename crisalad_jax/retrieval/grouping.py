@@ -1,6 +1,6 @@
 """Grouping protocols: which images attend to each other in the cross-image encoder.
 
-A descriptor of such a model depends on the images that its own image attended to. A recall
+With such a model, the descriptor of an image depends on the images that it attended to. A recall
 therefore means nothing without its protocol, for queries and for the database.
 """
 
@@ -23,36 +23,36 @@ GROUPINGS = {
 """Groupings of the images of one side, queries or database. The two sides never mix."""
 
 MASKED = "masked"
-"""The batches of `sequential`, in which an image does not see the others of its own place. It takes
-the truth, so that only an evaluation has it."""
+"""The batches of `sequential`, in which an image does not attend to others of its own place. It
+needs the ground truth, so only an evaluation can use it."""
 _WORDS = GROUPINGS | {MASKED: "as sequential, but no image sees another of its own place"}
 
 DEFAULT_GROUPINGS = ("single", "shuffled", "sequential", "window/single")
-"""The last is a robot's: it has its latest frames, and a map of images described alone."""
+"""The last is for a robot, with its latest frames and a map of images described independently."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Grouping:
     """A protocol: one of `GROUPINGS` or `MASKED` for the queries and one for the database.
 
-    `window` takes the order of the files for the order in time. That holds for numbered frames, but
-    @UTM names are sorted by easting. A database by `window` is a map whose images were described
-    one by one while they were recorded.
+    `window` assumes that files are in temporal order. That holds for numbered frames, but @UTM
+    names are sorted by easting. A database under `window` is a map whose images were described one
+    by one as they were recorded.
     """
 
     queries: str
     database: str
     batch_size: int | None = None
-    """Images that attend to each other; None is the batch in which images are read."""
+    """Images that attend to each other; None is the batch size in which images are read."""
 
     @classmethod
     def parse(cls, text: str) -> "Grouping":
-        """Read "window/single", queries and database apart, or "single" for both alike.
+        """Parse "window/single", for queries and database, or "single", for both.
 
         A size may follow, as in "sequential@26".
 
         Raises:
-            InputError: an unknown grouping, more than two, or no such size.
+            InputError: an unknown grouping, more than two, or an invalid size.
         """
         names, at, size = text.partition("@")
         kinds, expected = names.split("/"), None
@@ -76,13 +76,13 @@ class Grouping:
 
 
 def grouping_words(groupings: Iterable[str]) -> str:
-    """Explain groupings in words, for under a table.
+    """Explain groupings, for a note below a table.
 
     Args:
         groupings: some of `GROUPINGS`, or `MASKED`.
 
     Returns:
-        A clause for each, in their order.
+        A clause for each, in order.
 
     Example:
         >>> grouping_words(["single"])
@@ -92,7 +92,7 @@ def grouping_words(groupings: Iterable[str]) -> str:
 
 
 def parse_groupings(texts: Iterable[str]) -> list[Grouping]:
-    """Read protocols in order, without repeats.
+    """Parse protocols in order, without repeats.
 
     Raises:
         InputError: what `Grouping.parse` raises.
@@ -101,16 +101,16 @@ def parse_groupings(texts: Iterable[str]) -> list[Grouping]:
 
 
 class Batches(NamedTuple):
-    """All images of a side in batches, and whose descriptor each batch gives."""
+    """All images of a side in batches, and which descriptors to take from each batch."""
 
     images: Int64[np.ndarray, "batch place"]
-    """The images of each batch, by number; a place of padding repeats one of them."""
+    """Indices of the images of each batch; a padding place repeats one of them."""
     filled: Bool[np.ndarray, "batch place"]
-    """Whether a place holds an image, and not padding."""
+    """Whether a place holds an image rather than padding."""
     kept: Bool[np.ndarray, "batch place"]
-    """Whether a place's descriptor is kept; every image is kept in exactly one batch."""
+    """Whether to take the descriptor at a place; each image's is taken from exactly one batch."""
     grouping: str
-    """One of `GROUPINGS`, or `MASKED`: under "single" each image attends to itself alone."""
+    """One of `GROUPINGS`, or `MASKED`; under "single" each image attends only to itself."""
 
     def part(self, start: int, stop: int) -> "Batches":
         """Return batches `start` to `stop`."""
@@ -121,7 +121,7 @@ class Batches(NamedTuple):
     def attention_mask(self) -> Bool[np.ndarray, "batch place place"]:
         """Whether the image at place i of a batch attends to the one at place j.
 
-        Each attends to itself. None attends to padding.
+        Every image attends to itself, and none to padding.
         """
         seen = self.filled & (self.grouping != "single")
         return seen[:, :, None] & seen[:, None, :] | np.eye(self.images.shape[1], dtype=bool)
@@ -130,16 +130,15 @@ class Batches(NamedTuple):
 def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Batches:
     """Split images 0 to `count` into batches under one of `GROUPINGS`.
 
-    Under `window`, image i has a batch of its own: the last `batch_size` images up to and with i
-    (the first images have fewer). Only the descriptor of i is kept. One long batch with a banded
-    mask would not do: over several layers, information from images before the window would arrive.
+    Under `window`, image i has its own batch: the last `batch_size` images up to and including i
+    (fewer for the first images). Only the descriptor of i is taken. One long batch with a banded
+    mask would not work: over several layers, information from before the window would leak in.
 
     Args:
         count: images of the side.
         grouping: how they are grouped.
         batch_size: images that attend to each other.
-        seed: draws the order of `shuffled`.
-
+        seed: random seed of the order in `shuffled`.
     """
     order = np.arange(count)
     if grouping == "window":

@@ -1,4 +1,4 @@
-"""Describe images with a model in JAX, over all devices that can share a batch."""
+"""Describe images with a JAX model, on all devices that can share a batch."""
 
 import functools
 import itertools
@@ -31,10 +31,10 @@ from crisalad_jax.utils.devices import Devices, devices_for, over_images
 
 
 class JaxDescriber:
-    """A `Describer` of a model in JAX."""
+    """A `Describer` for a JAX model."""
 
     def __init__(self, params: Crisalad, config: ModelConfig) -> None:
-        """Check that the parameters are of the configuration, and cast them once."""
+        """Check that the parameters match the configuration, and cast them once."""
         check_params(params, config)
         self.config = config
         self.preparation = Preparation.of(config)
@@ -45,9 +45,9 @@ class JaxDescriber:
         """A batch size, the devices that share such a batch, and the parameters on them."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let pickle send it to another process, whose CPU becomes as many devices as here.
+        """Let pickle send it to another process, whose CPU is split into as many devices as here.
 
-        A batch has other bits where more or fewer devices share it.
+        The bits of a batch depend on the number of devices that share it.
         """
         devices = jax.local_device_count() if jax.default_backend() == "cpu" else None
         return _sent, (jax.tree.map(np.asarray, self._given), self.config, devices)
@@ -81,7 +81,7 @@ class JaxDescriber:
         rows: Float[np.ndarray, "group image row"],
         mask: Bool[np.ndarray, "group image image"],
     ) -> Float[np.ndarray, "group image descriptor"]:
-        """Make descriptors of the tokens of some groups of images; see `Describer.attend`."""
+        """Compute descriptors from the tokens of groups of images; see `Describer.attend`."""
         return np.asarray(_attend(self._params, rows, mask, self.config))
 
 
@@ -93,7 +93,7 @@ def _sent(params: Crisalad, config: ModelConfig, devices: int | None) -> JaxDesc
 @over_images("images", 1)
 @functools.partial(compiler.jit, static_argnames="config")
 def _token_rows(params: Crisalad, images: Images, config: ModelConfig) -> Float[Array, "image row"]:
-    """Extract tokens, and flatten each image's into a row."""
+    """Extract tokens, and flatten those of each image into a row."""
     tokens = extract_tokens(params, images, config)
     width = config.token_shape.tokens * config.token_shape.token_dim
     local = tokens.local.reshape(len(images), width)

@@ -17,13 +17,13 @@ from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
 QUERY_CHUNK = 1024
 """Queries compared at a time: with 4,096 database rows their products are 16 MiB."""
 _SPARE = 16
-"""Candidates kept beyond k, for products that float32 cannot tell apart."""
+"""Extra candidates beyond k, for products that float32 cannot distinguish."""
 _PIECE = 2**17
-"""Size of a piece that is multiplied in float64, in numbers: 1 MiB, which fits a core's cache."""
+"""Number of values multiplied in float64 at a time: 1 MiB, which fits a core's cache."""
 _READ = 2**22
-"""Size of the candidates that are read from a database at a time, in numbers: 16 MiB."""
+"""Number of values in the candidate rows read from a database at a time: 16 MiB."""
 _PARTITIONED = 1024
-"""Number of rows whose products set the first limit to candidates."""
+"""Number of rows whose products set the first threshold for candidates."""
 _LEAST = -2.0
 """Less than any product of unit vectors."""
 
@@ -40,16 +40,16 @@ class Neighbours(NamedTuple):
         return Neighbours(*(part[:, :k] for part in self))
 
     def in_order(self) -> "Neighbours":
-        """Sort each query's neighbours by falling similarity, and then by index."""
+        """Sort the neighbours of each query by descending similarity, then by index."""
         order = np.lexsort((self.indices, -self.similarities))
         return Neighbours(*(np.take_along_axis(part, order, axis=1) for part in self))
 
 
 class Products(NamedTuple):
-    """Products in float32 of database rows and some queries."""
+    """Float32 products of database rows with some queries."""
 
     first: int
-    """Number of the first query."""
+    """Index of the first query."""
     values: Float32[np.ndarray, "row q"]
     indices: Int64[np.ndarray, "row _"]
     """Database index of each row: (row, 1), or (row, q) where it differs from query to query."""
@@ -64,16 +64,16 @@ class _Pairs(NamedTuple):
 
 
 Stream = Callable[[], Generator[Block, None, None]]
-"""Yields all blocks of a database, each time that it is called."""
+"""Yields all blocks of a database each time it is called."""
 ReadRows = Callable[[Int64[np.ndarray, " m"]], Float[np.ndarray, "m d"]]
-"""Reads the rows of a database at some indices, in ascending order."""
+"""Reads database rows by index, in ascending order."""
 
 
 def rounding(length: int) -> float:
-    """Bound the rounding error of a float32 product of two descriptors, in any order of sums.
+    """Bound the rounding error of a float32 product of descriptors, in any summation order.
 
-    The probabilistic bound of Higham and Mary (2019), lambda sqrt(n) u, at lambda = 8, where it
-    fails less than once in 10^9 products; the sum of |a_i b_i| is at most the lengths' product.
+    This is the probabilistic bound of Higham and Mary (2019), lambda sqrt(n) u, with lambda = 8: it
+    fails less than once in 10^9 products. The sum of |a_i b_i| is at most the product of the norms.
     """
     return 8 * math.sqrt(length) * 2.0**-24 * (1 + UNIT_TOLERANCE) ** 2
 
@@ -84,7 +84,7 @@ def exact_similarities(
     query: Int[np.ndarray, " pair"],
     row: Int[np.ndarray, " pair"],
 ) -> Float32[np.ndarray, " pair"]:
-    """Compute products of pairs in float64, in a fixed order of sums, rounded to float32."""
+    """Compute products of pairs in float64, in a fixed summation order, rounded to float32."""
     similarities = np.empty(len(query), np.float32)
     size = max(1, _PIECE // queries.shape[1])
     for start in range(0, len(query), size):
@@ -92,7 +92,7 @@ def exact_similarities(
         products = rows[row[piece]].astype(np.float64)
         products *= queries[query[piece]]
         similarities[piece] = products.sum(axis=1)
-    return similarities + np.float32(0)  # turns -0.0 into 0.0, so that both sort alike
+    return similarities + np.float32(0)  # turns -0.0 into 0.0, so that they sort the same
 
 
 def similarities_of(
@@ -101,7 +101,7 @@ def similarities_of(
     index: Int[np.ndarray, " pair"],
     read_rows: ReadRows,
 ) -> Float32[np.ndarray, " pair"]:
-    """Compute `exact_similarities` of rows anywhere in a database, read in its order."""
+    """Compute `exact_similarities` for any rows of a database, read in database order."""
     similarities = np.empty(len(query), np.float32)
     order = np.argsort(index, kind="stable")
     size = max(1, _READ // queries.shape[1])
@@ -109,14 +109,14 @@ def similarities_of(
     def fill(start: int) -> None:
         piece = order[start : start + size]
         numbers = index[piece]
-        # Not `np.unique`, which would import masked arrays into every query.
+        # Not `np.unique`, which would import masked arrays on the first query.
         is_new = np.append(True, numbers[1:] != numbers[:-1])
         rows = read_rows(numbers[is_new])
         row = np.cumsum(is_new) - 1
         similarities[piece] = exact_similarities(queries, rows, query[piece], row)
 
     starts = range(0, len(order), size)
-    if len(starts) == 1:  # a thread would take longer to start
+    if len(starts) == 1:  # starting a thread would take longer
         fill(0)
     else:
         with ThreadPoolExecutor(usable_cores()) as threads:
@@ -127,15 +127,15 @@ def similarities_of(
 def multiply(
     stream: Generator[Block, None, None], queries: Queries, size: int
 ) -> Generator[Products, None, None]:
-    """Multiply all queries and all blocks, of at most `size` rows, by numpy."""
-    # Allocating new memory takes longer than writing the products. Two, for `one_ahead`.
+    """Multiply all queries with all blocks, of at most `size` rows, in NumPy."""
+    # Allocating memory takes longer than writing the products. Two buffers, for `one_ahead`.
     shape = size, min(QUERY_CHUNK, len(queries))
     memory = itertools.cycle([np.empty(shape, np.float32) for _ in range(2)])
     for block in one_ahead(stream):
         indices = block.start + np.arange(len(block.rows))[:, None]
         for first in range(0, len(queries), QUERY_CHUNK):
             some = queries[first : first + QUERY_CHUNK]
-            # The queries are the right factor: the product then takes a tenth less time.
+            # With the queries as the right factor, the product takes a tenth less time.
             out = next(memory)[: len(block.rows), : len(some)]
             yield Products(first, np.matmul(block.rows, some.T, out=out), indices)
 
@@ -148,21 +148,21 @@ def nearest(
     size: int,
     products: Callable[[int], Generator[Products, None, None]] | None = None,
 ) -> Neighbours:
-    """Find the k most similar rows of each query, exactly; of equal ones the lower indices.
+    """Find the k most similar rows of each query, exactly; ties go to the lower indices.
 
-    The largest float32 products of each query are its candidates, some more than k. Those that may
-    be among the k best, whatever the rounding, are compared by `exact_similarities`. Where rows
-    that are not candidates may be, as of many copies of an image, the database is read again. Then
-    all rows are compared exactly whose products come near the k-th similarity.
+    The candidates of a query are its largest float32 products, somewhat more than k. Those that may
+    be among the k best, given the rounding error, are compared by `exact_similarities`. If other
+    rows may be too, as with many copies of an image, the database is read again, and all rows whose
+    products are close to the k-th similarity are compared exactly.
 
     Args:
-        stream: of a database of at least k rows.
+        stream: yields the blocks of a database of at least k rows.
         queries: unit descriptors.
         k: neighbours per query.
         read_rows: reads rows of the database.
-        size: number of rows in a block, at most.
-        products: yields products of all queries and blocks, at least the given number of largest
-            ones of each block; None multiplies by numpy.
+        size: maximum number of rows in a block.
+        products: yields products of all queries with all blocks, at least the given number of the
+            largest ones of each block; None multiplies in NumPy.
     """
     margin = np.float32(2 * rounding(queries.shape[1]))
     width = k + _SPARE
@@ -191,10 +191,10 @@ def nearest(
 
 
 def best_products(products: Generator[Products, None, None], queries: int, k: int) -> Neighbours:
-    """Find the k largest products of each query, which are exact; of equal ones the lower indices.
+    """Find the k largest of some exact products of each query; ties go to the lower indices.
 
     Args:
-        products: of all queries and at least k rows, in the order of the rows.
+        products: of all queries with at least k rows, in row order.
         queries: number of queries.
         k: neighbours per query.
     """
@@ -210,24 +210,24 @@ def _largest(
     score: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     margin: float = 0.0,
 ) -> tuple[_Pairs, Float32[np.ndarray, " q"]]:
-    """Find the pairs of the `count` largest values of each query; see `_first`.
+    """Find the pairs with the `count` largest values of each query; see `_first`.
 
     Args:
-        products: of all queries and blocks.
-        least: products up to these are left out; they rise to the `count`-th value, less `margin`.
-        count: how many pairs of each query.
-        score: computes the values of pairs; None takes their products.
-        margin: by how much a product may be below its value.
+        products: of all queries with all blocks.
+        least: products up to these are skipped; raised in place to the `count`-th value - `margin`.
+        count: number of pairs per query.
+        score: computes the values of pairs; None uses their products.
+        margin: how far a product may be below its value.
 
     Returns:
-        The pairs, and the products up to which others were left out.
+        The pairs, and the products up to which others were skipped.
     """
     empty = np.empty(0, np.int64)
     waiting = [_Pairs(empty, empty, np.empty(0, np.float32))]
     for first, values, indices in one_ahead(products):
         part = least[first : first + values.shape[1]]
         if len(values) >= count and part.min() == _LEAST:
-            # Of some rows, since partitioning takes longer than multiplying.
+            # Only some rows, since partitioning takes longer than multiplying.
             some = np.partition(values[: max(count, _PARTITIONED)], -count, axis=0)[-count]
             np.maximum(part, np.nextafter(some, np.float32(_LEAST)), out=part)
         row, query = np.nonzero(values > part)
@@ -242,7 +242,7 @@ def _largest(
 def _raised(
     waiting: Sequence[_Pairs], least: Float32[np.ndarray, " q"], count: int, margin: float
 ) -> _Pairs:
-    """Return the `_first` of some pairs, and raise `least` to the last where there are `count`."""
+    """Return the `_first` of the pairs, and raise `least` to the last of queries with `count`."""
     pairs = _first(_Pairs(*map(np.concatenate, zip(*waiting, strict=True))), count)
     is_full = np.bincount(pairs.query, minlength=len(least)) == count
     last = np.flatnonzero(_rank(pairs.query) == count - 1)
@@ -251,12 +251,12 @@ def _raised(
 
 
 def _first(pairs: _Pairs, count: int) -> _Pairs:
-    """Sort pairs by query, then falling value, then index; keep `count` of each query at most."""
+    """Sort pairs by query, descending value and index; return at most `count` of each query."""
     order = np.lexsort((pairs.index, -pairs.value, pairs.query))
     order = order[_rank(pairs.query[order]) < count]
     return _Pairs(*(column[order] for column in pairs))
 
 
 def _rank(query: Int64[np.ndarray, " pair"]) -> Int64[np.ndarray, " pair"]:
-    """Count the pairs of the same query before each; queries are in ascending order."""
+    """Count the pairs of the same query that precede each pair; queries are in ascending order."""
     return np.arange(len(query)) - np.searchsorted(query, query)

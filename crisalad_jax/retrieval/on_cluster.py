@@ -1,4 +1,4 @@
-"""Describe images here, or on a Ray cluster, whose nodes read them and send descriptors back."""
+"""Describe images here, or on a Ray cluster whose nodes read them and return descriptors."""
 
 import dataclasses
 import functools
@@ -22,20 +22,20 @@ from crisalad_jax.utils.host import usable_cores
 
 
 class Describing(NamedTuple):
-    """What describes a list of images independently: a model, and how."""
+    """A model and settings to describe a list of images independently."""
 
     describer: Describer
     reading: Reading
     components: Pca | None = None
     tokens: bool = False
-    """Whether images give their tokens, as of `token_rows`, and not descriptors."""
+    """Whether to return tokens, as `token_rows` does, instead of descriptors."""
 
     def stream(
         self, paths: Sequence[pathlib.Path], address: str | None = None
     ) -> Iterator[Described]:
         """Describe images in order, in this process or on the cluster at an address.
 
-        The batches are the same, and so are the bits on machines of one kind.
+        The batches are the same either way, and on machines of one kind so are the bits.
 
         Raises:
             InputError: what `described` raises, or `cluster.connected`, `check_nodes` and
@@ -55,7 +55,7 @@ class Describing(NamedTuple):
             "prepare": functools.partial(load_plugins, loaded_plugins()),
             "environment": environment,
         }
-        # A cache is of this process.
+        # A cache belongs to this process.
         work = self._replace(reading=dataclasses.replace(self.reading, cache=None))
         with cluster.connected(address) as ray:
             cluster.check_nodes(ray, read=[_whole(paths[0]), _whole(paths[-1])])
@@ -65,14 +65,14 @@ class Describing(NamedTuple):
                 yield part
 
     def piece(self, given: tuple[int, Sequence[pathlib.Path]]) -> Described:
-        """Describe some consecutive images on a node, with the number of the first."""
+        """Describe consecutive images on a node, given the index of the first and their paths."""
         first, paths = given
         own = dataclasses.replace(self.reading, threads=usable_cores())
         found = concatenated(list(self._replace(reading=own).stream(paths)))
         return found._replace(indices=found.indices + first, unreadable=found.unreadable + first)
 
     def _check_unreadable(self, path: pathlib.Path) -> None:
-        """Check that an image that a node left out cannot be read here either."""
+        """Check that an image that a node could not read is unreadable here too."""
         reading = dataclasses.replace(self.reading, threads=0)
         (batch,) = reading.batches([path], self.describer.preparation)
         if batch.valid[0]:

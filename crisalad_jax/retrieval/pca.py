@@ -1,4 +1,4 @@
-"""Principal components of descriptors: fewer numbers each, with or without whitening."""
+"""Principal components of descriptors: fewer dimensions, with or without whitening."""
 
 import dataclasses
 import hashlib
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from crisalad_jax.retrieval.describer import Describer
 
 FORMAT = "crisalad-jax pca 2"
-"""The one key of a file's metadata; its value is JSON: the file's checksum and the `PcaConfig`."""
+"""The only metadata key of a file; its value is JSON: the file's checksum and the `PcaConfig`."""
 SAMPLES = 2**14
-"""Largest number of descriptors that components are fitted to, as in CricaVPR."""
+"""Maximum number of descriptors that components are fitted to, as in CricaVPR."""
 _ARRAYS = ("mean", "components", "variances", "total")
 _CHUNK_BYTES = 2**26
 
@@ -37,12 +37,12 @@ class PcaConfig:
     """How descriptors are reduced to their components."""
 
     whiten: bool = False
-    """Divide every component by its standard deviation, for all to count alike (Jegou and Chum,
+    """Divide every component by its standard deviation, so all weigh the same (Jegou and Chum,
     2012). CricaVPR does not."""
     renormalise: bool = True
-    """Make the reduced descriptors unit vectors again, as `retrieval.search` and all that compares
-    by cosine take them (and Jegou and Chum after whitening). CricaVPR leaves them as they are, and
-    searches by L2: its published figures are without."""
+    """Normalise the reduced descriptors to unit length again, as `retrieval.search` and all cosine
+    comparisons expect (and as Jegou and Chum do after whitening). CricaVPR does not, and searches
+    by L2: its published figures are without it."""
 
     def __post_init__(self) -> None:
         """Check the types."""
@@ -55,46 +55,46 @@ class Pca(NamedTuple):
 
     mean: Float32[np.ndarray, " d"]
     components: Float32[np.ndarray, "dim d"]
-    """Orthonormal rows by falling variance; the largest number of each in size is positive."""
+    """Orthonormal rows by descending variance; the largest entry of each in size is positive."""
     variances: Float32[np.ndarray, " dim"]
     """Sample variances (divided by n - 1) of the fitted descriptors along the components."""
     total: Float32[np.ndarray, ""]
     """Variance of the fitted descriptors in all directions."""
     config: PcaConfig
     model: str = ""
-    """The `model_hash` of the model whose descriptors were fitted; "" where it is not known."""
+    """The `model_hash` of the model whose descriptors were fitted; "" if it is not known."""
 
     @property
     def kept(self) -> float:
-        """Share of the variance that lies along the components, 0 to 1."""
+        """Share of the variance that the components explain, 0 to 1."""
         return float(self.variances.sum() / self.total)
 
     def apply(self, descriptors: Descriptors) -> Float32[np.ndarray, "n dim"]:
         """Reduce descriptors to their components, a few thousand rows at a time.
 
         Raises:
-            InputError: descriptors of another length than those that were fitted, no matrix, or
-                rows that are not finite.
+            InputError: descriptors that are not a matrix, are not finite, or have another length
+                than those that were fitted.
         """
-        if len(descriptors):  # none are shortened too: a batch may have no readable image
+        if len(descriptors):  # a batch may have no readable image
             descriptors = as_rows(descriptors, "descriptors", len(self.mean))
         reduced = np.empty((len(descriptors), len(self.components)), np.float32)
         size = _rows_at_a_time(len(self.mean))
         for start, rows in blocks(descriptors, "descriptors", size, unit=False):
             part = (rows - self.mean) @ self.components.T / self._scale
             if self.config.renormalise:
-                with np.errstate(invalid="ignore"):  # one at the mean has no direction: NaN
+                with np.errstate(invalid="ignore"):  # the mean itself has no direction: NaN
                     part /= np.linalg.norm(part, axis=1, keepdims=True)
             reduced[start : start + len(part)] = part
         return reduced
 
     @property
     def _scale(self) -> Float32[np.ndarray, "*dim"]:
-        """What components are divided by."""
+        """The divisors of the components."""
         return np.sqrt(self.variances) if self.config.whiten else np.ones((), np.float32)
 
     def projection(self) -> "tuple[Linear, ProjectionConfig]":
-        """Return the same components as a model's last layer.
+        """Return the components as the last layer of a model.
 
         Returns:
             Parameters in float32, and configuration, of `Crisalad.projection`.
@@ -113,16 +113,20 @@ class Pca(NamedTuple):
 def shortened(
     pca: Pca | None, describer: "Describer", name: str, *, unit: bool = False
 ) -> tuple[int, bool]:
-    """Check that components fit a model; return the descriptors' length, and if they are unit.
+    """Check that components fit a model, and return what its descriptors become.
 
     Args:
         pca: the components; None leaves descriptors as they are.
         describer: the model.
-        name: what messages call the model, or what asks for the descriptors.
-        unit: whether these have to be unit vectors.
+        name: name in messages of the model, or of what asks for the descriptors.
+        unit: whether the descriptors must be unit vectors.
+
+    Returns:
+        The length of the descriptors, and whether they are unit vectors.
 
     Raises:
-        InputError: the components were fitted to other descriptors, or no unit vectors are left.
+        InputError: the components were fitted to other descriptors, or unit vectors are required
+            and these are not.
     """
     config = describer.config
     length, is_unit = config.descriptor_dim, config.unit_length
@@ -157,29 +161,29 @@ def fit_pca(
     name: str = "descriptors",
     quiet: bool = True,
 ) -> Pca:
-    """Fit `dim` principal components, in memory that depends on d alone.
+    """Fit `dim` principal components, in memory that depends only on d.
 
-    The d x d covariance is summed in float64 over some rows at a time, and its leading eigenvectors
-    computed. Fewer descriptors than d give the same components from their n x n Gram matrix. All
-    are read twice, first for their mean.
+    The d x d covariance is summed in float64, some rows at a time, and its leading eigenvectors are
+    computed. If there are fewer descriptors than d, their n x n Gram matrix gives the same
+    components. All descriptors are read twice, first for their mean.
 
     Args:
         descriptors: n descriptors, as `retrieval.search` takes them, of any length.
-        dim: components that are kept.
+        dim: number of components.
         config: whether to whiten, and whether to normalise.
-        samples: fit at most so many descriptors, drawn at random; None for all.
-        seed: draws them.
-        model: the `model_hash` of the model that made the descriptors, which others are refused by.
-        name: what messages call the descriptors, such as their file.
+        samples: fit at most this many descriptors, drawn at random; None for all.
+        seed: random seed of the draw.
+        model: the `model_hash` of the model that made the descriptors; other models are refused.
+        name: name of the descriptors in messages, such as their file.
         quiet: no progress bar.
 
     Returns:
-        The components, which `Pca.apply` shortens descriptors by.
+        The components, for `Pca.apply`.
 
     Raises:
-        InputError: an array that is empty, no matrix, or holds a row that is not finite; fewer
-            than two descriptors or samples; `dim` below 1, or above the rank of what is fitted; a
-            negative seed.
+        InputError: an array that is empty, not a matrix, or has a row that is not finite; fewer
+            than two descriptors or samples; `dim` below 1, or above the rank of the fitted
+            descriptors; a negative seed.
 
     Example:
         >>> import numpy as np
@@ -210,7 +214,7 @@ def fit_pca(
         centred = (rows - mean for rows in wide())
         if count <= length:
             together = np.concatenate(list(centred))
-            covariance = together @ together.T / (count - 1)  # its Gram matrix: the same variances
+            covariance = together @ together.T / (count - 1)  # the Gram matrix: the same variances
         else:
             covariance = np.zeros((length, length))
             for rows in centred:
@@ -237,16 +241,16 @@ class Plane(NamedTuple):
 
 
 def project_to_plane(descriptors: Descriptors) -> Plane:
-    """Project descriptors to the plane in which they vary most, for a picture of them.
+    """Project descriptors onto the plane in which they vary most, to plot them.
 
-    The plane is that of the first two principal components. Distances in it are at most those of
-    the descriptors.
+    The plane is that of the first two principal components. Distances in it are at most those
+    between the descriptors.
 
     Args:
         descriptors: n descriptors, as `search` takes them.
 
     Returns:
-        Positions about the mean, and the share of the variance that each axis shows.
+        Positions relative to the mean, and the share of the variance along each axis.
 
     Raises:
         InputError: what `fit_pca` raises; it needs three descriptors that are not on a line.
@@ -269,9 +273,9 @@ def _leading(
     matrix: Float64[np.ndarray, "m m"], dim: int, count: int, length: int
 ) -> tuple[Float64[np.ndarray, " dim"], Float64[np.ndarray, "dim m"]]:
     """Return the `dim` largest eigenvalues and their vectors, largest first."""
-    # OpenBLAS, which comes with it, waits for ever for memory that is not there: ask first.
+    # SciPy's OpenBLAS waits forever for memory that is not available: allocate it first.
     np.empty((1 + (os.cpu_count() or 1), 2**25), np.uint8)
-    import scipy.linalg  # takes a tenth of a second, which applying components does not need
+    import scipy.linalg  # takes a tenth of a second, and is not needed to apply components
 
     size = len(matrix)
     values, vectors = scipy.linalg.eigh(
@@ -288,7 +292,7 @@ def _leading(
 
 
 def pca_hash(pca: Pca) -> str:
-    """Compute a digest of components: of their numbers, and of how they are applied."""
+    """Compute a digest of components: of their values, and of how they are applied."""
     digest = hashlib.sha256(json.dumps(to_plain(pca.config), sort_keys=True).encode())
     for name in _ARRAYS:
         digest.update(np.ascontiguousarray(getattr(pca, name)).data)
@@ -296,11 +300,11 @@ def pca_hash(pca: Pca) -> str:
 
 
 def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
-    """Write the components as safetensors, their configuration in the metadata.
+    """Write the components as safetensors, with their configuration in the metadata.
 
     Args:
-        path: the file, a .safetensors.
-        pca: the components, of `fit_pca`.
+        path: the .safetensors file.
+        pca: the components, from `fit_pca`.
 
     Raises:
         InputError: the file cannot be written.
@@ -322,13 +326,13 @@ def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
 
     Args:
         path: the file.
-        verify: whether to check that the file's bytes are those that were written.
+        verify: whether to check the file against its checksum.
 
     Returns:
         The components.
 
     Raises:
-        InputError: the file is missing, changed, cut short or no such file, or its arrays do not
+        InputError: the file is missing, changed, truncated or of another kind, or its arrays do not
             fit each other.
 
     Example:

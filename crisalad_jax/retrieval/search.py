@@ -1,6 +1,6 @@
 """Exact search for the most similar descriptors.
 
-The protocol is the public one of visual place recognition: exact nearest neighbours.
+This is the public protocol of visual place recognition: exact nearest neighbours.
 """
 
 import functools
@@ -44,34 +44,35 @@ def search(
 ) -> Neighbours:
     """Find the most similar database descriptors of each query, exactly.
 
-    The database may be a memory map, larger than memory. It is read once, `chunk` rows at a time,
-    one chunk ahead; the best rows are read once more. Beyond the inputs, memory holds three chunks
-    and their similarities to 1,024 queries, whatever the size of the database. Pages of a memory
-    map are released after use. Where some queries have many near copies in the database, it is read
-    a second time.
+    The database may be a memory map that is larger than memory. It is read once, `chunk` rows at a
+    time and one chunk ahead; the best rows are then read again. Apart from the inputs, memory holds
+    three chunks and their similarities to 1,024 queries, whatever the size of the database. Pages
+    of a memory map are released after use. If queries have many near copies in the database, it is
+    read a second time.
 
-    Products in float32 select candidates. Numpy multiplies on a CPU, the devices elsewhere. A
-    candidate's final similarity is summed in float64 and rounded to float32: the same bits whatever
-    the chunk and the devices. Equal similarities are ordered by database index, lower first.
+    Float32 products select candidates; NumPy computes them on a CPU, the devices otherwise. The
+    final similarity of a candidate is summed in float64 and rounded to float32, so its bits depend
+    on neither chunk nor devices. Equal similarities are ordered by database index, lower first.
 
-    Packed bits are compared by their Hamming distance, by numpy. Their similarity is 1 - 2 h / d,
-    where h of the d bits differ: the cosine of the vectors of signs.
+    Packed bits are compared by Hamming distance, in NumPy. Their similarity is 1 - 2 h / d, where
+    h of the d bits differ: the cosine of the sign vectors.
 
     Args:
         database: unit descriptors of the n database images, in float32, float16 or bfloat16 (which
-            a .npy file holds as two bytes without a type, "V2"), or other numbers that become
-            float32; or bits of `pack_bits`.
+            a .npy file stores as two untyped bytes, "V2"), or in another type that is converted to
+            float32; or bits from `pack_bits`.
         queries: unit descriptors of the q queries, or their bits.
-        k: neighbours per query; a database of fewer images gives all of them, min(k, n).
-        chunk: database rows compared at a time, rounded up so that devices share alike.
+        k: neighbours per query, or all n images of a smaller database.
+        chunk: database rows compared at a time, rounded up to a multiple of the devices.
         quiet: no progress bar.
 
     Returns:
         Indices into the database and similarities, (q, k), best first.
 
     Raises:
-        InputError: an array that is empty, no matrix, or holds a row that is not finite or not of
-            unit length; descriptors of two lengths; bits on one side alone; k or chunk below 1.
+        InputError: an array that is empty, not a matrix, or has a row that is not finite or not of
+            unit length; descriptors of different lengths; bits on only one side; k or chunk below
+            1.
 
     Example:
         >>> import numpy as np
@@ -108,24 +109,24 @@ def search(
 def to_unit_vectors(
     database: Descriptors, queries: Float[np.ndarray, "q d"]
 ) -> tuple[Float32[np.ndarray, "n d+3"], Float32[np.ndarray, "q d+3"]]:
-    r"""Embed descriptors so that their cosines rank as the Euclidean distances do.
+    r"""Embed descriptors so that their cosines rank them as the Euclidean distances do.
 
-    With both sides divided by the largest length, x of the database and y of the queries become
+    After both sides are divided by the largest norm, x of the database and y of the queries become
 
     $$\left(\sqrt{\tfrac23}\,x,\ \tfrac{|x|^2}{\sqrt3},\ a,\ 0\right) \quad\text{and}\quad
     \left(\sqrt{\tfrac23}\,y,\ -\tfrac{1}{\sqrt3},\ 0,\ b\right),$$
 
-    where a and b fill the lengths up to 1. The cosine is then (|y|^2 - |x - y|^2) / 3.
+    where a and b bring the norms to 1. The cosine is then (|y|^2 - |x - y|^2) / 3.
 
     Args:
-        database: descriptors of the n database images, of any lengths.
-        queries: descriptors of the q queries, of any lengths.
+        database: descriptors of the n database images, of any norms.
+        queries: descriptors of the q queries, of any norms.
 
     Returns:
-        Unit vectors of both sides, three numbers longer.
+        Unit vectors of both sides, with three more dimensions.
 
     Raises:
-        InputError: a side is not a matrix, or is empty; the sides' widths differ; a number is not
+        InputError: a side is not a matrix, or is empty; the sides' widths differ; a value is not
             finite.
 
     Example:
@@ -154,9 +155,9 @@ def to_unit_vectors(
 def _by_devices(
     stream: Generator[Block, None, None], queries: Queries, size: int, width: int
 ) -> Generator[Products, None, None]:
-    """Multiply on the devices, over which the rows of a block are sharded.
+    """Multiply on the devices, with the rows of a block sharded over them.
 
-    Each device names the `width` largest products of its rows with each query.
+    Each device returns the `width` largest products of its rows with each query.
     """
     devices = devices_for(size)
     width = min(width, size // devices.mesh.size)
@@ -188,7 +189,7 @@ def _largest(
     mesh: Mesh,
     width: int,
 ) -> tuple[Float32[Array, "m q"], Int32[Array, "m q"]]:
-    """Find the largest products of each device's rows, and their places; rows from `valid` pad."""
+    """Find the largest products on each device, and their places; rows from `valid` are padding."""
 
     def on_a_device(rows: Array, valid: Array, queries: Array) -> tuple[Array, Array]:
         wide = rows.astype(jnp.float32)

@@ -1,10 +1,10 @@
-"""Rows of numbers that grow in a folder, segment by segment: what `extract` and `index` resume.
+"""Append rows to a folder, segment by segment, so that `extract` and `index` can resume.
 
-A segment's rows go to a store. Then its record, JSON with a checksum, appears under its name: that
-single rename commits the segment. Whoever is killed at any moment leaves the rows as they were
-before the segment or after it.
+The rows of a segment go to a store. Then its record, JSON with a checksum, is renamed to its final
+name: that single rename commits the segment. A process killed at any moment leaves the rows as they
+were before the segment or after it.
 
-A change commits any number of segments by one record of its own. The names of their records say
+A change commits any number of segments with one record of its own. The names of their records say
 which change they wait for.
 """
 
@@ -25,7 +25,7 @@ from crisalad_jax.utils.files import atomic_path, read_json
 from crisalad_jax.utils.shapes import Int64
 
 SEGMENT = 256
-"""Number of images appended together, and so described again at most after a kill."""
+"""Number of images appended together: at most this many are described again after a kill."""
 
 
 Take = Callable[[Mapping[str, Any], pathlib.Path], None]
@@ -42,7 +42,7 @@ class Segment(NamedTuple):
 
 
 def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | None = None) -> None:
-    """Write an object as JSON with its checksum, whole or not at all, and flush it to the disk.
+    """Write an object as JSON with its checksum, atomically, and flush it to the disk.
 
     Raises:
         InputError: the disk is full, or the folder cannot be written to.
@@ -52,7 +52,7 @@ def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | Non
 
 
 class Segments:
-    """Rows in a store, and the records in a folder that say which of them count."""
+    """Rows in a store, and the records in a folder that say which of them are committed."""
 
     def __init__(
         self, folder: pathlib.Path, store: Store, dtype: str, take: Take | None = None
@@ -63,23 +63,23 @@ class Segments:
             folder: of the records.
             store: of the rows.
             dtype: of the rows.
-            take: is given each record and its file in order, now and when it is appended: of
-                segments with the `names` of their rows, and of changes with the number of `rows`
-                that are there after. By default the former go to `records`.
+            take: called with each record and its file in order, now and when one is appended.
+                Records of segments have the `names` of their rows, those of changes the number of
+                `rows` after them. By default, records are appended to `records`.
 
         Raises:
-            InputError: a record or its rows are damaged or gone.
+            InputError: a record or its rows are damaged or missing.
         """
         self.folder, self.store, self._dtype = folder, store, np.dtype(dtype)
         self.spans: list[Segment] = []
         self.records: list[Mapping[str, Any]] = []
         self._give: Take = take or (lambda record, _: self.records.append(record))
         self.paths: list[pathlib.Path] = []
-        """The files of the segments' records."""
+        """The files of the records of the segments."""
         self.changes = 0
         """Number of changes."""
-        # A writer adds records in order, so those that are listed now have all before them. It may
-        # add more while they are read. Segments of a change are there before its record.
+        # A writer adds records in order, so all records before the listed ones exist. It may add
+        # more while they are read. The segments of a change exist before its record.
         later = set(folder.glob("change-*.json"))
         changes: collections.deque[tuple[dict[str, Any], pathlib.Path]] = collections.deque()
         while (path := self.change_path(self.changes)).exists():
@@ -97,7 +97,7 @@ class Segments:
                 self._give(*changes.popleft())
             self._take(record, path)
             self._give(record, path)
-        if not self.change_path(self.changes).exists():  # or it and others came meanwhile
+        if not self.change_path(self.changes).exists():  # else it and others were added meanwhile
             _check_all_read(set(listed.values()), path)
         for change, path in changes:
             if change.get("rows") != len(self):
@@ -113,15 +113,15 @@ class Segments:
         return self.spans[-1].first + self.spans[-1].count if self.spans else 0
 
     def path(self, first: int) -> pathlib.Path:
-        """Return the file of the record of the segment that begins with a row."""
+        """Return the path of the record of the segment that starts at a row."""
         return self.folder / f"{first:010d}.json"
 
     def change_path(self, number: int) -> pathlib.Path:
-        """Return the file of the record of a change, by its number from 0."""
+        """Return the path of the record of a change, by its number from 0."""
         return self.folder / f"change-{number:010d}.json"
 
     def waiting(self) -> list[pathlib.Path]:
-        """List the records of segments whose change is not there, in order."""
+        """List the records of segments whose change does not exist yet, in order."""
         numbered = ((path, path.stem.partition(".")[2]) for path in self.folder.glob("[0-9]*.json"))
         count = self.changes
         return sorted(path for path, of in numbered if of.isdecimal() and int(of) >= count)
@@ -139,10 +139,10 @@ class Segments:
         self.paths.append(path)
 
     def append(self, record: Mapping[str, Any], rows: Descriptors) -> None:
-        """Append a segment: it is there for good once this returns, and not at all before.
+        """Append a segment: it is committed once this returns, and not at all before.
 
         Args:
-            record: JSON values, among them `names`, one of each row.
+            record: JSON values, including `names`, one for each row.
             rows: the rows.
 
         Raises:
@@ -163,11 +163,11 @@ class Segments:
     def change(
         self, record: Mapping[str, Any], parts: Iterable[tuple[Mapping[str, Any], Descriptors]] = ()
     ) -> None:
-        """Append segments and record a change: all is there once this returns, and none before.
+        """Append segments and record a change: all are committed on return, and none before.
 
         Args:
-            record: JSON values of the change, which the parts may complete.
-            parts: record and rows of each segment, as of `append`.
+            record: JSON values of the change, which `parts` may add to while it yields.
+            parts: record and rows of each segment, as in `append`.
 
         Raises:
             InputError: the store or the folder cannot be written to.
@@ -193,9 +193,9 @@ class Segments:
             self._give(*each)
 
     def remove_waiting(self) -> int:
-        """Remove the segments whose change is not there; return how many there were."""
+        """Remove the segments whose change does not exist; return how many there were."""
         waiting = self.waiting()
-        for record in reversed(waiting):  # so that a kill leaves the rows of one without a record
+        for record in reversed(waiting):  # so a kill leaves only rows without a record
             record.unlink()
             self.store.drop(_first_of(record))
         return len(waiting)
@@ -206,14 +206,14 @@ class Segments:
             yield self.store.read(span.first, span.count)
 
     def __getitem__(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
-        """Read rows of files by number, in any order."""
+        """Read rows by index, in any order."""
         return self.store.rows(numbers)
 
     def verify(self) -> None:
         """Read all rows, and compare them with the digests in the records.
 
         Raises:
-            InputError: one has changed; the message says in which segment.
+            InputError: a row has changed; the message says in which segment.
         """
         for span, rows in zip(self.spans, self.blocks(), strict=True):
             if _sha256(rows, self._dtype) != span.sha256:
@@ -224,7 +224,7 @@ class Segments:
 
 
 def _first_of(path: pathlib.Path) -> int:
-    """Return the number of the first row of the segment whose record is at `path`; -1 of others."""
+    """Return the index of the first row of the segment recorded at `path`; -1 for other files."""
     first = path.name.partition(".")[0]
     return int(first) if first.isdecimal() else -1
 
@@ -239,7 +239,7 @@ def _sha256(rows: np.ndarray, dtype: np.dtype) -> str:
 
 
 def digest_of(names: Sequence[str], settings: Mapping[str, Any]) -> str:
-    """Compute a digest of what all rows of a collection depend on."""
+    """Compute a digest of everything that the rows of a collection depend on."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for name in names:
         digest.update(f"{name}\n".encode(errors="surrogateescape"))

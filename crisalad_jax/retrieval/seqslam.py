@@ -1,4 +1,4 @@
-"""SeqSLAM: lines through the differences of the last frames to a map's images, in their order.
+"""SeqSLAM: lines through the differences between the last frames and the images of a map.
 
 Milford and Wyeth, ICRA 2012.
 """
@@ -19,9 +19,9 @@ class SeqSlamState(NamedTuple):
     """What the search knows after some frames."""
 
     belief: PerPlace
-    """Share of each image of the map; see `SeqSlam`."""
+    """Softmax share of each image of the map; see `SeqSlam`."""
     common: PerPlace
-    """Similarity of each image to the mean descriptor of the map, which is not used."""
+    """Similarity of each image to the mean descriptor of the map; not used."""
     rows: Float64[np.ndarray, "frame place"]
     """Enhanced differences of the last frames to all images."""
     frames: int
@@ -32,19 +32,20 @@ class SeqSlamState(NamedTuple):
 class SeqSlam:
     """SeqSLAM (Milford and Wyeth, ICRA 2012), for consecutive frames of one camera.
 
-    A frame's difference to an image, one less their similarity, is enhanced: the mean over the
-    images around is taken away, and their deviation divides it. An image's score is the least sum
-    of enhanced differences along a line that ends at it with the last frame. Lines have velocities
-    from `slowest` to `fastest` in steps of 0.1 images of the map a frame, and go to the nearest
-    image; before the first image they stay at it. Shares of images are the softmax of minus their
-    scores, which the paper does not have. Nor does it compare by the cosine, but by sums of
-    absolute differences of small, patch-normalised images (the model `thumbnail`).
+    The difference between a frame and an image, one minus their similarity, is enhanced: the mean
+    over the surrounding images is subtracted, and the result is divided by their deviation. The
+    score of an image is the smallest sum of enhanced differences along a line that ends at it with
+    the last frame. Lines have velocities from `slowest` to `fastest` in steps of 0.1 images of the
+    map per frame, and are rounded to the nearest image; they stop at the first image. The share of
+    an image is the softmax of its negative score, which the paper does not have. The paper also
+    compares not by cosine, but by sums of absolute differences of small, patch-normalised images
+    (the model `thumbnail`).
 
     Args:
         length: number of last frames that a line goes through.
-        window: number of images around one, half on either side, that differences are enhanced by.
-        slowest: least velocity.
-        fastest: largest velocity.
+        window: number of surrounding images, half on either side, for enhancing differences.
+        slowest: lowest velocity.
+        fastest: highest velocity.
 
     Raises:
         InputError: a number out of range.
@@ -74,7 +75,7 @@ class SeqSlam:
 
     @property
     def velocities(self) -> Float64[np.ndarray, " line"]:
-        """The velocities of lines, in images of the map a frame."""
+        """The velocities of lines, in images of the map per frame."""
         steps = round((self.fastest - self.slowest) / 0.1)
         # Rounded, so that halves of an image are halves.
         return np.linspace(self.slowest, self.fastest, steps + 1).round(9)
@@ -83,10 +84,10 @@ class SeqSlam:
         """Begin a sequence anywhere in a map.
 
         Args:
-            common: a number for each image; only how many there are counts.
+            common: a value for each image; only their number is used.
 
         Raises:
-            InputError: no places, or a number that is not finite.
+            InputError: no places, or a value that is not finite.
         """
         common = checked("common", common, (max(1, np.size(common)),))
         count = len(common)
@@ -96,15 +97,15 @@ class SeqSlam:
         """Take the next frame into account.
 
         Args:
-            state: after the frame before.
+            state: after the previous frame.
             similarities: of the frame to every image of the map: cosines of descriptors.
-            moved: not used: a line counts frames.
+            moved: not used, since lines count frames.
 
         Returns:
             The state after this frame.
 
         Raises:
-            InputError: similarities that are not one finite number a place.
+            InputError: similarities that are not one finite number per place.
         """
         differences = 1 - checked("similarities", similarities, state.common.shape)
         enhanced = self.enhance(differences)[None]
@@ -118,7 +119,7 @@ class SeqSlam:
         return SeqSlamState(belief / belief.sum(), state.common, rows, state.frames + 1)
 
     def enhance(self, differences: PerPlace) -> Float[np.ndarray, " place"]:
-        """Enhance the contrast of a frame's differences locally; at the ends fewer are around."""
+        """Enhance the contrast of a frame's differences locally; windows are cut at the ends."""
         side, count = self.window // 2, len(differences)
         first = (np.arange(count) - side).clip(0)
         end = (np.arange(count) + side + 1).clip(max=count)
@@ -126,5 +127,5 @@ class SeqSlam:
         sums = np.concatenate([np.zeros((1, 2)), np.cumsum([centred, centred**2], axis=1).T])
         mean, square = ((sums[end] - sums[first]) / (end - first)[:, None]).T
         deviation = np.sqrt(np.maximum(square - mean**2, 0))
-        # Below this the differences are the same but for rounding.
+        # Below this, the differences are equal up to rounding.
         return (centred - mean) / np.where(deviation > 1e-7, deviation, np.inf)

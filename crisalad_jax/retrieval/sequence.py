@@ -1,11 +1,10 @@
 """Sequence evidence: a discrete Bayes filter over the images of a map, in their order.
 
-The state is the number of the image at which the camera is. Frames of a query come one after the
-other; each moves the belief by a model of motion, and weighs it by the similarities of the frame
-to all images. Where it is known when or where images and frames were taken, motion is in seconds or
-metres, so that the two may have any frame rates. The idea is of Xu, Suenderhauf and Milford 2021,
-"Probabilistic Visual Place Recognition for Hierarchical Localization" (RA-L); the likelihood here
-is another one.
+The state is the index of the image at which the camera is. The frames of a query arrive in order;
+each moves the belief by a motion model, and weights it by the similarities of the frame to all
+images. If the times or positions of images and frames are known, motion is in seconds or metres, so
+their frame rates may differ. The idea is from Xu, Suenderhauf and Milford 2021, "Probabilistic
+Visual Place Recognition for Hierarchical Localization" (RA-L); the likelihood is a different one.
 """
 
 import dataclasses
@@ -19,11 +18,11 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float64, Int64
 
 PerPlace = Float[np.ndarray, " place"]
-"""A number for each image of a map, float64 in a `SequenceState`."""
+"""A value for each image of a map, float64 in a `SequenceState`."""
 _PRIOR_FRAMES = 10
-"""Number of frames that the map's own mean counts for in the mean of the frames so far."""
+"""Weight of the map's mean in the mean of the frames so far, as a number of frames."""
 _ROUNDING = 5e-4
-"""Seconds or metres that rounding may hide: videos' times are in whole milliseconds."""
+"""Tolerance for rounding, in seconds or metres: video times are in whole milliseconds."""
 
 
 @brief
@@ -39,33 +38,33 @@ class SequenceState(NamedTuple):
     frames: int
     """Number of frames so far."""
     along: PerPlace
-    """How far along the map each image is: its number, or seconds or metres."""
+    """How far along the map each image is: its index, or seconds or metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BayesFilter:
     """A discrete Bayes filter over the images of a map, for consecutive frames of one camera.
 
-    Motion: the camera moves along the map at most `reach` times as fast as the map's own camera
-    did, either way, to each image as likely, and always as far as the next image; with probability
-    `jump` it may be anywhere. By default a frame counts as an image of the map; where times or
-    distances are known, `reach` is seconds of the map a second, or metres a metre. Evidence: the
-    likelihood of an image is exp(`sharpness` * z), where z is its similarity to the frame in
-    standard deviations from the mean over the map. So it does not depend on how close together a
-    model's similarities lie.
+    Motion: the camera moves along the map in either direction, at most `reach` times as fast as the
+    camera of the map did. All images within reach are equally likely, and the next image is always
+    within reach; with probability `jump` the camera may be anywhere. By default, a frame counts as
+    an image of the map; if times or distances are known, `reach` is in seconds of the map per
+    second, or metres per metre. Evidence: the likelihood of an image is exp(`sharpness` * z), where
+    z is its similarity to the frame in standard deviations from the mean over the map, so it does
+    not depend on how close together the similarities of a model are.
 
-    Where `adapt` is true, similarities are those of descriptors from which the mean of their side
-    was taken: of the map, and of the frames so far. That takes away what all frames of a day have
-    in common, such as its light (Schubert, Neubert and Protzel 2020, "Unsupervised Learning Methods
-    for Visual Place Recognition in Discretely and Continuously Changing Environments", ICRA). The
-    map's mean counts for ten frames in the second mean, until more are there.
+    If `adapt` is true, the mean of each side, the map or the frames so far, is subtracted from its
+    descriptors. That removes what all frames of a day have in common, such as its light (Schubert,
+    Neubert and Protzel 2020, "Unsupervised Learning Methods for Visual Place Recognition in
+    Discretely and Continuously Changing Environments", ICRA). In the mean of the frames, the mean
+    of the map counts as ten frames.
 
     Args:
-        reach: how far the camera moves at most: images of the map a frame, or seconds a second, or
-            metres a metre.
+        reach: the largest motion of the camera: images of the map per frame, seconds per second, or
+            metres per metre.
         jump: probability that a frame is anywhere, above 0 and below 1.
-        sharpness: weight of a frame against the frames before it.
-        adapt: whether the mean of each side is taken away.
+        sharpness: weight of a frame relative to the frames before it.
+        adapt: whether to subtract the mean of each side.
 
     Raises:
         InputError: a number out of range.
@@ -80,7 +79,7 @@ class BayesFilter:
     """
 
     counts_images: ClassVar[bool] = False
-    """Whether motion is in images of the map whatever is known of times and positions."""
+    """Whether motion is in images of the map, even if times and positions are known."""
     reach: float = 2.0
     jump: float = 0.01
     sharpness: float = 2.0
@@ -98,15 +97,15 @@ class BayesFilter:
 
         Args:
             common: similarity of each image to the mean descriptor of the map.
-            along: how far along the map each image is, in seconds or metres, never less than the
-                image before; None counts images.
+            along: how far along the map each image is, in seconds or metres, never decreasing;
+                None counts images.
 
         Returns:
             The state before the first frame.
 
         Raises:
-            InputError: no places, a similarity that is not finite, or `along` of another length,
-                or that decreases.
+            InputError: no places, a similarity that is not finite, or an `along` that decreases or
+                has another length.
         """
         common = checked("common", common, (max(1, np.size(common)),))
         count = len(common)
@@ -116,22 +115,22 @@ class BayesFilter:
         return SequenceState(np.full(count, 1 / count), common, np.zeros(count), 0, along)
 
     def predict(self, state: SequenceState, moved: float = 1.0) -> PerPlace:
-        """Move a belief from one frame to the next, by the model of motion.
+        """Move a belief from one frame to the next, by the motion model.
 
         Args:
-            state: after the frame before.
+            state: after the previous frame.
             moved: as in `step`.
 
         Returns:
-            The probability that the camera is at each image, before the next frame is looked at.
+            The probability that the camera is at each image, before the next frame is seen.
         """
         along, far = state.along, self.reach * moved + _ROUNDING
         numbers = np.arange(len(along))
-        # The next image is in reach however far it is, or a camera could never leave a gap.
+        # The next image is always in reach, or a camera could never cross a gap.
         first = np.minimum(np.searchsorted(along, along - far), numbers - 1).clip(0)
         end = np.maximum(np.searchsorted(along, along + far, "right"), numbers + 2)
         end = end.clip(max=len(along))
-        # At the ends of the map fewer images are in reach, which share what leaves an image.
+        # At the ends of the map, fewer images are in reach to share the probability of an image.
         total = np.concatenate([[0.0], np.cumsum(state.belief / (end - first))])
         return (1 - self.jump) * (total[end] - total[first]) + self.jump / len(along)
 
@@ -141,16 +140,16 @@ class BayesFilter:
         """Take the next frame into account.
 
         Args:
-            state: after the frame before.
+            state: after the previous frame.
             similarities: of the frame to every image of the map: cosines of descriptors.
-            moved: seconds or metres since the frame before, as the map's `along` is in; infinity
-                where that is unknown. Of a map that counts images, frames.
+            moved: seconds or metres since the previous frame, as in the map's `along`, or frames
+                for a map that counts images; infinity if unknown.
 
         Returns:
             The state after this frame.
 
         Raises:
-            InputError: `moved` below 0, or similarities that are not one finite number a place.
+            InputError: `moved` below 0, or similarities that are not one finite number per place.
         """
         require(moved >= 0, f"moved: found {moved}, expected at least 0")
         row = checked("similarities", similarities, state.common.shape)
@@ -176,13 +175,13 @@ class BayesFilter:
             similarities: of every frame, in order, to every image of the map.
             common: as in `start`.
             along: as in `start`.
-            moved: of every frame, as in `step`; None is a frame each.
+            moved: of every frame, as in `step`; None is one frame each.
 
         Returns:
-            The best place at each frame, from this frame and those before it.
+            The best place at each frame, given that frame and those before it.
 
         Raises:
-            InputError: `moved` of another number of frames, or what `start` and `step` raise.
+            InputError: `moved` of another length, or what `start` and `step` raise.
         """
         state, places, probabilities = self.start(common, along), [], []
         steps = np.ones(len(similarities)) if moved is None else np.asarray(moved)
@@ -200,13 +199,13 @@ class Followed(NamedTuple):
     """Where a camera was at each frame of a sequence."""
 
     places: Int64[np.ndarray, " frame"]
-    """Number of the most probable image of the map."""
+    """Index of the most probable image of the map."""
     probabilities: Float64[np.ndarray, " frame"]
-    """Probability that the camera is there; images beside it share what they have in common."""
+    """Probability that the camera is there; it is shared with similar images nearby."""
 
 
 def checked(name: str, values: PerPlace, shape: tuple[int, ...]) -> PerPlace:
-    """Return finite numbers of this shape, in float64; raise InputError where they are others."""
+    """Return values in float64; raise InputError if they are not finite or not of this shape."""
     if np.shape(values) != shape or not np.isfinite(values).all():
         found = f"shape {np.shape(values)}" if np.shape(values) != shape else "NaN or infinity"
         raise InputError(f"{name}: found {found}, expected shape {shape} of finite numbers")
@@ -214,12 +213,12 @@ def checked(name: str, values: PerPlace, shape: tuple[int, ...]) -> PerPlace:
 
 
 def _without_means(row: PerPlace, mean: PerPlace, common: PerPlace) -> PerPlace:
-    """Compute similarities of a frame without its side's mean to images without the map's.
+    """Compute similarities of a frame to images, with the mean of each side subtracted.
 
-    With unit descriptors d of the map, their mean m, a frame q and the mean f of the frames, it is
-    (d - m) . (q - f) / |d - m|. No descriptor is needed: `row` is d . q, `mean` d . f, `common`
-    d . m, and the average over the map of each of the three is its product with m.
+    For unit descriptors d of the map, their mean m, a frame q and the mean f of the frames, that is
+    (d - m) . (q - f) / |d - m|. No descriptor is needed: `row` is d . q, `mean` is d . f, `common`
+    is d . m, and averaging each of the three over the map gives its product with m.
     """
     products = (row - row.mean()) - (mean - mean.mean())
     lengths = np.sqrt(np.maximum(1 - 2 * common + common.mean(), 0))
-    return products / np.maximum(lengths, 1e-6)  # an image that is the mean itself says nothing
+    return products / np.maximum(lengths, 1e-6)  # an image equal to the mean is no evidence

@@ -1,10 +1,10 @@
-"""Procedural places of planar polygons, drawn through a pinhole camera: a city, and a world.
+"""Procedural places made of planar polygons, drawn by a pinhole camera: a city and a world.
 
-Both are written in two real layouts: GSV-Cities (Ali-bey et al. 2022) to train on, and that of
-VPR-datasets-downloader to evaluate on. The modules in the order of their imports: `view` (how a
-picture is taken); `mesh` (materials, polygons and what a place is); `things` and `buildings` (the
-contents of a place); `street`, `corridor` and `country` (its kinds); `light` and `picture`
-(drawing); `layouts`, `city` and `world` (the files).
+Both are written in the layouts of real data sets: GSV-Cities (Ali-bey et al. 2022) for training,
+and VPR-datasets-downloader for evaluation. The modules in import order: `view` (how a picture is
+taken); `mesh` (materials, polygons and what a place is); `things` and `buildings` (the contents of
+a place); `street`, `corridor` and `country` (kinds of places); `light` and `picture` (drawing);
+`layouts`, `city` and `world` (the files).
 """
 
 from crisalad_jax.synthetic.city import SyntheticCityConfig as SyntheticCityConfig

@@ -1,4 +1,4 @@
-"""The city: two cities to train on, and one to test on, in the layouts of real sets."""
+"""The city: two cities for training and one for testing, in the layouts of real data sets."""
 
 import dataclasses
 import math
@@ -57,19 +57,19 @@ class SyntheticCityConfig:
 
     @property
     def images(self) -> int:
-        """Number of all images."""
+        """Total number of images."""
         return self.train_places * len(SEASONS) + self.test_places * 2
 
 
 def write_synthetic_city(
     root: str | os.PathLike[str], config: SyntheticCityConfig, *, quiet: bool = False
 ) -> bool:
-    """Render the city into `root`, whole or not at all.
+    """Render the city into `root`, completely or not at all.
 
     `root/train` has the GSV-Cities layout with two cities. `root/test` has that of
     VPR-datasets-downloader (`images/test/{database,queries}`). Places are 80 m apart and the images
-    of one within 10 m, so that 25 m separate positives; no place is in both. `root/set.json` holds
-    the configuration; a root that holds the same city already is not changed.
+    of one within 10 m, so a radius of 25 m separates positives; no place is in both. The file
+    `root/set.json` stores the configuration; a root that already holds this city is not changed.
 
     Args:
         root: a folder that does not exist, or is empty, or holds this city.
@@ -77,7 +77,7 @@ def write_synthetic_city(
         quiet: no progress bar.
 
     Returns:
-        Whether it was written: False where it was there.
+        Whether it was written; False if it was there already.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
@@ -106,13 +106,13 @@ def _shots(config: SyntheticCityConfig, split: int, indices: range) -> Iterator[
 
 
 def _train_views(rng: Rng) -> list[View]:
-    """Go through the seasons and hours, in an order of the place's own."""
+    """Go through the seasons and hours in an order drawn for the place."""
     order = zip(rng.permutation(4), rng.permutation(4), strict=True)
     return [_draw_view(rng, SEASONS[season], _HOURS[hour]) for season, hour in order]
 
 
 def _test_views(rng: Rng) -> list[View]:
-    """Draw a database image of a day in spring or summer, and a query of autumn or winter."""
+    """Draw a daytime database image in spring or summer, and a query in autumn or winter."""
     database = _draw_view(rng, SEASONS[rng.integers(2)], "noon")
     season, time = SEASONS[2 + rng.integers(2)], TIMES[rng.choice(3, p=(0.4, 0.4, 0.2))]
     return [database, _draw_view(rng, season, time)]

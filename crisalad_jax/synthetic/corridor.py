@@ -1,4 +1,4 @@
-"""One place indoors: a corridor, a hall or a room, with all that stands and hangs in it."""
+"""One place indoors: a corridor, a hall or a room, with everything that stands or hangs in it."""
 
 from typing import NamedTuple
 
@@ -59,7 +59,7 @@ def corridor(rng: Rng) -> Place:
 
 
 def room(rng: Rng) -> Place:
-    """Build a room: a wide box with things along its end, too, and furniture on its floor."""
+    """Build a room: a wide box, also with things along its end, and furniture on its floor."""
     width, length = rng.uniform(3.5, 10.0), rng.uniform(7.0, 13.0)
     left = -width * rng.uniform(0.3, 0.7)
     box = _Box(left, left + width, rng.uniform(2.3, 4.2), length)
@@ -181,7 +181,7 @@ def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
 
 
 def _end(mesh: Mesh, rng: Rng, box: _Box) -> None:
-    """Add what closes the corridor: a wall, a door, a window, or a way on."""
+    """Add what closes the corridor: a wall, a door, a window, or an opening."""
     left, right, height, length = box
     wall, end = pick(rng, WALLS), mesh.front(0.0, length, 0)
     end.add(rects(left, 0, right, height), wall)
@@ -228,9 +228,9 @@ def _stains(front: Mesh, rng: Rng, wall: Colour, box: _Box) -> None:
 
 
 def _along_wall(front: Mesh, rng: Rng, start: float, stop: float, height: float) -> None:
-    """Add doors, windows, boards and furniture along one wall, each at its place."""
+    """Add doors, windows, boards and furniture along one wall, one after another."""
     doors, trim = pick(rng, _WOOD), 0.9 * pick(rng, _WOOD)
-    # What recurs in this corridor; the distances, and what comes between, make the place.
+    # What recurs in this corridor; the spacing, and what comes between, identifies the place.
     kinds = ("door", "recess", "window", "board", "pillar", "cupboard", "bench", "box")
     kinds += ("opening", "pipe")
     weights = rng.dirichlet(np.full(len(kinds), 0.7))
@@ -288,7 +288,7 @@ def _door(here: Mesh, rng: Rng, wide: float, top: float, doors: Colour, trim: Co
 
 
 def _furniture(here: Mesh, rng: Rng, kind: str, wide: float, height: float) -> None:
-    """Add what stands out of the wall: a pillar, a cupboard, a bench, a pipe or a box."""
+    """Add what protrudes from the wall: a pillar, a cupboard, a bench, a pipe or a box."""
     colour = pick(rng, _WOOD + WALLS)
     if kind == "pillar":
         rect, out = (0, 0, rng.uniform(0.3, 0.7), height), rng.uniform(0.1, 0.5)
@@ -309,7 +309,7 @@ def _furniture(here: Mesh, rng: Rng, kind: str, wide: float, height: float) -> N
 
 
 def _stand(foot: Mesh, rng: Rng) -> None:
-    """Add what stands free on a floor: a table, a chair, a shelf, a plant or a lamp."""
+    """Add a free-standing object: a table, a chair, a shelf, a plant or a lamp."""
     colour = pick(rng, _WOOD + SIGNS)
     half, deep, tall = rng.uniform(0.2, 0.9), rng.uniform(0.4, 1.2), rng.uniform(0.4, 0.8)
     kind = draw_kind(rng, table=0.35, chair=0.25, chest=0.2, plant=0.1, lamp=0.1)
@@ -348,7 +348,7 @@ def _columns(mesh: Mesh, rng: Rng, box: _Box) -> None:
 
 
 def _hanging(mesh: Mesh, rng: Rng, box: _Box) -> None:
-    """Add signs under the ceiling, and things that stand about on the floor."""
+    """Add signs under the ceiling, and objects on the floor."""
     left, right, height, length = box
     for z in rng.uniform(4.0, length, int(rng.integers(0, 4))):
         x, wide = rng.uniform(left, right - 0.5), rng.uniform(0.3, 1.2)

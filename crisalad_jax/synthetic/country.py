@@ -31,11 +31,11 @@ _FIELDS = palette("55 50 28, 42 34 24, 36 46 22, 62 56 36, 30 36 20, 66 62 24")
 _STONES = palette("50 49 46, 42 40 37, 60 57 50")
 _ASPHALT = palette("30 30 31, 42 41 39, 50 47 42")
 _FAR = 140.0
-"""Metres to which what lies along the way is drawn."""
+"""Metres up to which objects along the way are drawn."""
 
 
 class _Way:
-    """The course of the way: x of its middle, a parabola through the camera's foot."""
+    """The course of the way: x of its middle, a parabola through the point below the camera."""
 
     def __init__(self, rng: Rng) -> None:
         self._bend = rng.normal(0.0, 0.0022)
@@ -52,7 +52,7 @@ class _Way:
         return polygons(*near, *far)
 
     def strip(self, low: float, high: float) -> np.ndarray:
-        """Make a band all the way."""
+        """Make a band along the entire way."""
         z = np.concatenate((np.arange(-4.0, 40, 3.0), np.arange(40, _FAR + 1, 12.5)))
         return self.band(z[:-1], z[1:], low, high)
 
@@ -83,7 +83,7 @@ def country(rng: Rng) -> Place:
 
 def _fields(mesh: Mesh, rng: Rng) -> None:
     """Add a meadow, fields and tufts."""
-    # In bands, because a part has one depth, whose haze it gets.
+    # In bands, because a part has a single depth, which decides its haze.
     for near, far in ((300, 2500), (120, 300), (50, 120), (15, 50), (-20, 15)):
         mesh.ground(flat(-900, near, 900, far), (0.44, 0.46, 0.40), Kind.GRASS)
     for side in (-1.0, 1.0):
@@ -204,7 +204,7 @@ def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
 
 
 def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
-    """Add woods as outlines at several distances, and single trees before them."""
+    """Add woods as outlines at several distances, and single trees in front of them."""
     for z in sorted(rng.uniform(18, 300, int(rng.integers(1, 6))), reverse=True):
         if rng.random() < 0.3:
             continue

@@ -1,6 +1,6 @@
-"""Rendered sets on disk: a folder that is written whole or not at all, and the layouts in it.
+"""Rendered sets on disk: a folder that is written completely or not at all, and its layouts.
 
-A set is written from a stream of files, each its path within the set's folder and its bytes.
+A set is written from a stream of files, each a path within the set's folder and its bytes.
 """
 
 import dataclasses
@@ -24,28 +24,28 @@ from crisalad_jax.utils.progress import progress_bar
 Files = Iterator[tuple[str, bytes]]
 
 RENDERER = 1
-"""Version of the renderer: increase it if pictures change, and sets on disk no longer match."""
+"""Version of the renderer: increase it if pictures change; sets on disk then no longer match."""
 _FILE = "set.json"
 _METRES_PER_DEGREE = 111_195.0
 """Metres in a degree of latitude, on a sphere of radius 6371 km."""
 _LONGITUDE = -40.0
 """Degrees east of all training cities, which lie in an ocean."""
 _UTM_ORIGIN = (500_000.0, 5_000_000.0)
-"""East and north in zone 32T of a test set's south-west corner."""
+"""Easting and northing of a test set's south-west corner, in zone 32T."""
 _MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
 
 
 def write_set(root: str | os.PathLike[str], config: Any, files: Files, *, quiet: bool) -> bool:
-    """Write a set into `root`, whole or not at all, unless it is there.
+    """Write a set into `root`, completely or not at all, unless it is there already.
 
     Args:
         root: a folder that does not exist, or is empty, or holds this set.
-        config: the set's configuration, a dataclass, which the file set.json in the folder holds.
-        files: the set.
+        config: the set's configuration, a dataclass; it is stored as set.json in the folder.
+        files: the files of the set.
         quiet: no progress bar.
 
     Returns:
-        Whether it was written: False where it was there.
+        Whether it was written; False if it was there already.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
@@ -83,13 +83,13 @@ class Shot(NamedTuple):
     rng: Rng
     """Draws the year and the panorama's name."""
     east: float = 0.0
-    """Metres from the set's south-west corner, as `north` is."""
+    """Metres from the set's south-west corner, like `north`."""
     north: float = 0.0
     northdeg: int = 0
     """Degrees of the camera from north."""
 
     def draw_date(self) -> tuple[int, int]:
-        """Draw the year, and take the month of the season."""
+        """Draw the year; the month is that of the season."""
         return int(self.rng.integers(2012, 2022)), _MONTHS[self.view.season]
 
     def draw_panoid(self) -> str:
@@ -116,9 +116,9 @@ def utm_images(shots: Iterable[Shot], scenery: str = "", *, camera: bool = False
     """Lay out test images as VPR-datasets-downloader does: names with positions in metres.
 
     Args:
-        shots: a database image and a query in turn.
-        scenery: what the names call the places.
-        camera: whether names have the direction and height of the camera, and the date.
+        shots: database images and queries, alternating.
+        scenery: name of the places in the file names.
+        camera: whether names include the direction and height of the camera, and the date.
     """
     for side, shot in zip(itertools.cycle(("database", "queries")), shots, strict=False):
         east, north = _UTM_ORIGIN[0] + shot.east, _UTM_ORIGIN[1] + shot.north
@@ -133,7 +133,7 @@ def utm_images(shots: Iterable[Shot], scenery: str = "", *, camera: bool = False
 
 
 def derive_seed(*numbers: int) -> int:
-    """Derive the seed of a place: of a set's seed, a split and a number, it is one of its own."""
+    """Derive a place's own seed, for instance from a set's seed, a split and a number."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
 
 

@@ -17,11 +17,11 @@ class Light(NamedTuple):
     zenith: np.ndarray
     horizon: np.ndarray
     elevation: float
-    """Degrees of the sun over the horizon."""
+    """Degrees of the sun above the horizon."""
     lit: float
     """Brightness of lamps and windows, 0 to 1."""
     veil: np.ndarray = np.full(3, 0.22)
-    """What distance turns into."""
+    """Colour into which distant parts fade."""
     visibility: float = 45.0
     """Metres over which contrast falls to 1/e."""
     to_sun: np.ndarray = np.zeros(3)
@@ -54,7 +54,7 @@ _LEAVES: dict[Season, tuple[Colour, ...]] = {
     "autumn": palette("70 46 12, 60 23 10"),
     "winter": palette("40 34 29, 40 34 29"),
 }
-"""Two hues by season, between which leaves lie; in winter a tree has none, and a bush twigs."""
+"""Two hues per season between which leaves lie; in winter trees have none, and bushes twigs."""
 _SNOW: dict[int, float] = {
     Kind.ROOF: 0.92,
     Kind.LEDGE: 0.75,
@@ -79,9 +79,9 @@ GLOW: dict[int, tuple[float, Vector]] = {
 
 
 def light_of(view: View, place: Place, rng: Rng) -> Light:
-    """Combine the light of the hour with the weather and the season's sun, or take lamps' light.
+    """Combine the light of the hour with the weather and the season's sun, or use lamplight.
 
-    The sun's place is drawn: about south at noon, west at dusk.
+    The sun's direction is drawn at random: about south at noon, west at dusk.
     """
     light = (_INDOORS if place.indoors else _OUTDOORS)[view.time]
     if not place.indoors:
@@ -144,7 +144,7 @@ def shining(
 
 
 def _by_kind(scene: Scene, values: dict[int, float]) -> Float[np.ndarray, " part"]:
-    """Look up every part's value by its kind; 0 where there is none."""
+    """Look up every part's value by its kind, 0 by default."""
     table = np.zeros(max(Kind) + 1)
     table[list(values)] = list(values.values())
     return table[scene.kind]

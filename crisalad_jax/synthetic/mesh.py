@@ -1,7 +1,7 @@
 """The geometry of a place, in metres: x to the right across the street, y up, z along it.
 
-The camera of the default view stands at x = z = 0. A scene is a list of parts, painted from the far
-ones to the near.
+The camera of the default view stands at x = z = 0. A scene is a list of parts, painted from far to
+near.
 """
 
 import copy
@@ -18,11 +18,11 @@ Colour = np.ndarray
 """Red, green and blue, 0 to 1."""
 Vector = tuple[float, float, float]
 Paint = Colour | Vector
-"""A part's colour, or in `Kind.LEAF` and `Kind.BUSH` its share of the second hue and its shade."""
+"""A part's colour; for `Kind.LEAF` and `Kind.BUSH` its share of the second hue and its shade."""
 Number = int | float | np.ndarray
 Polygons = Float[np.ndarray, "polygon corner 3"]
 Rect = tuple[Number, Number, Number, Number]
-"""The left, low, right and high edges of rectangles."""
+"""The left, bottom, right and top edges of rectangles."""
 Rng = np.random.Generator
 Lanes = tuple[float, float, float, float]
 """x of the left fronts, the left kerb, the right kerb and the right fronts of a street."""
@@ -35,14 +35,14 @@ UP: Vector = (0.0, 1.0, 0.0)
 DOWN: Vector = (0.0, -1.0, 0.0)
 TO_CAMERA: Vector = (0.0, 0.0, -1.0)
 SLANTED: Vector = (0.0, 0.5, -0.85)
-"""Direction of what is round or slopes towards the camera."""
+"""Normal of parts that are round or slope towards the camera."""
 
 
 class Kind(enum.IntEnum):
     """Material of a part, which decides how season and light change it.
 
-    SOIL is a field or ballast: of its own colour, under snow in winter. BUSH is leaves that are
-    bare twigs in winter. WINDOW is an opening to the sky, seen from inside.
+    SOIL is a field or ballast: it has its own colour, and snow on it in winter. BUSH is leaves that
+    become bare twigs in winter. WINDOW is an opening to the sky, seen from inside.
     """
 
     SOLID, ROOF, LEDGE, PAVEMENT, ROAD, GRASS, LEAF, NEEDLE = range(8)
@@ -64,17 +64,17 @@ GLASS = np.array((0.16, 0.20, 0.25))
 
 
 def draw_kind(rng: Rng, **shares: float) -> str:
-    """Draw one of the names, by their shares, which sum to 1."""
+    """Draw one of the names with these probabilities, which sum to 1."""
     return str(rng.choice(tuple(shares), p=tuple(shares.values())))
 
 
 def pick(rng: Rng, colours: tuple[Colour, ...], spread: float = 0.06) -> Colour:
-    """Draw one of the colours, up to a share `spread` lighter or darker."""
+    """Draw one of the colours, made lighter or darker by a fraction of up to `spread`."""
     return colours[rng.integers(len(colours))] * (1 + rng.uniform(-spread, spread))
 
 
 def polygons(*corners: tuple[Number, Number, Number]) -> Polygons:
-    """Make a polygon of each element of the coordinates, which are broadcast to one shape."""
+    """Make a polygon from each element of the coordinates, which are broadcast to one shape."""
     numbers = [number for corner in corners for number in corner]
     table = np.empty((*np.broadcast(*numbers).shape, len(numbers)))
     for column, number in enumerate(numbers):
@@ -135,17 +135,17 @@ class Scene(NamedTuple):
 
 
 class Mesh:
-    """A scene being built of parts: polygons of one colour, one normal and one layer."""
+    """A scene under construction; its parts are polygons of one colour, normal and layer."""
 
     def __init__(self, eye: float = EYE) -> None:
-        """Start without parts; cameras are some `eye` metres above the ground."""
+        """Start without parts; cameras are about `eye` metres above the ground."""
         self.eye = eye
         self.layer = 0.0
-        """Painting order of the parts to come: larger is farther away, and painted first."""
+        """Painting order of subsequent parts: larger is farther away, and painted first."""
         self.normal: Vector = TO_CAMERA
-        """Direction that the parts to come face unless told otherwise."""
+        """Direction that subsequent parts face by default."""
         self.sees_start = False
-        """Whether the camera sees the ends towards small u of a front, or those towards large u."""
+        """Whether the camera sees the ends of a front at small u, rather than those at large u."""
         self.end_normal: Vector = UP
         self._origin, self._axes = np.zeros(3), np.eye(3)
         self.bodies: list[Body] = []
@@ -155,17 +155,17 @@ class Mesh:
         self._parts: list[tuple[np.ndarray, Paint, Vector, int, float]] = []
 
     def at(self, x: float, z: float, layer: float | None = None) -> "Mesh":
-        """Return the same mesh with its origin at (x, z), in a layer, or that of distance z."""
+        """Return the same mesh with its origin at (x, z), in `layer` or that of distance z."""
         here = copy.copy(self)
         here._origin = self.world(np.array((x, 0.0, z)))
         here.layer = float(z if layer is None else layer)
         return here
 
     def front(self, x: float, z: float, side: float, layer: float | None = None) -> "Mesh":
-        """Return the same mesh in other axes: those of a vertical plane, in the layer given.
+        """Return the same mesh in the axes of a vertical plane, in the given layer.
 
-        u runs along the plane, v up, d out of it. The plane stands on (x, z), on a side of the
-        street, which is -1 or 1, or across the street where that is 0.
+        u runs along the plane, v up, d out of it. The plane stands at (x, z): along a side of the
+        street if `side` is -1 or 1, across the street if it is 0.
         """
         front = self.at(x, z, self.layer if layer is None else layer)
         along = np.array((0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0))
@@ -187,14 +187,14 @@ class Mesh:
         normal: Vector | None = None,
         layer: float | None = None,
     ) -> None:
-        """Add a part; without polygons it is left out."""
+        """Add a part, unless it has no polygons."""
         if len(polygons):
             layer = self.layer if layer is None else layer
             part = self.world(polygons), albedo, normal or self.normal, int(kind), layer
             self._parts.append(part)
 
     def ground(self, polygons: Polygons, albedo: Paint, kind: Kind = Kind.SOLID) -> None:
-        """Add a part of the ground, over those before it."""
+        """Add a part of the ground, on top of earlier ones."""
         self.add(polygons, albedo, kind, UP, GROUND_LAYER + 1)
 
     def block(self, low: Vector, high: Vector, albedo: Paint) -> None:
@@ -217,7 +217,7 @@ class Mesh:
         self.add(rects(u0, v0, u1, v1, out), albedo, kind)
 
     def scene(self) -> Scene:
-        """Make a scene of all parts, of which there has to be at least one."""
+        """Make a scene from all parts, of which there must be at least one."""
         parts, *materials = zip(*self._parts, strict=True)
         points = np.concatenate([part.reshape(-1, 3) for part in parts])
         counts = np.array([len(part) for part in parts])
@@ -229,13 +229,13 @@ class Reach(NamedTuple):
     """Where cameras stand in a place."""
 
     height: tuple[float, float]
-    """Least and most metres from the ground."""
+    """Minimum and maximum metres above the ground."""
     lateral: float
-    """Most metres to the side."""
+    """Maximum metres to the side."""
     forward: float
-    """Most metres along it, from a station."""
+    """Maximum metres along the place, from a station."""
     step: float
-    """Metres from one station to the next, which are places of their own that look alike."""
+    """Metres from one station to the next; stations are separate places that look similar."""
 
 
 class Place(NamedTuple):

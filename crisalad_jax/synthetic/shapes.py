@@ -1,7 +1,7 @@
-"""One place of boxes, poles and sheets that mean nothing, with patterns on them.
+"""One place made of meaningless boxes, poles and sheets, with patterns on them.
 
-What a model learns of streets and rooms it may know by their windows and doors. Here all forms,
-sizes and colours are drawn freely (after "dead leaves", Baradad et al. 2021, but in space).
+A model may learn to recognise streets and rooms by their windows and doors. Here all shapes, sizes
+and colours are drawn freely (after "dead leaves", Baradad et al. 2021, but in 3D).
 """
 
 import numpy as np

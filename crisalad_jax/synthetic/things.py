@@ -1,4 +1,4 @@
-"""What stands, drives and walks in a place: trees, lamps, wires, monuments, vehicles, people."""
+"""Objects and passers-by of a place: trees, lamps, wires, monuments, vehicles, people."""
 
 import functools
 
@@ -104,7 +104,7 @@ def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
 def build_passers(seed: int, lanes: Lanes, traffic: bool, crowd: int = 0) -> Scene:
     """Build cars along the kerbs, traffic in the lanes, people on the pavements, and a crowd.
 
-    Without traffic there are people alone; one is far away, so that there is somebody.
+    Without traffic there are only people; one is far away, so that there is always somebody.
     """
     rng = np.random.default_rng((seed, 1))
     mesh = Mesh()

@@ -13,8 +13,8 @@ Season = Literal["spring", "summer", "autumn", "winter"]
 Time = Literal["noon", "dusk", "night"]
 Weather = Literal["clear", "overcast", "haze", "rain"]
 Scenery = Literal["street", "corridor", "country", "room", "shapes"]
-"""What a place is: a city's street, a corridor or hall, a road or railway through the country, a
-furnished room, or boxes, poles and sheets in the open that mean nothing."""
+"""Kind of place: a city street, a corridor or hall, a road or railway through the country, a
+furnished room, or meaningless boxes, poles and sheets in the open."""
 
 SEASONS: tuple[Season, ...] = get_args(Season)
 TIMES: tuple[Time, ...] = get_args(Time)
@@ -24,9 +24,9 @@ SCENERIES: tuple[Scenery, ...] = get_args(Scenery)
 EYE = 2.4
 """Metres from the ground to the camera of the default view."""
 PITCH = 8.0
-"""Degrees by which it looks up."""
+"""Degrees by which the camera of the default view looks up."""
 NEAR = 0.4
-"""Metres from the camera to the plane behind which nothing is seen."""
+"""Metres from the camera to the near plane; nothing nearer is seen."""
 Repaint = Annotated[float, limited(0, 3)]
 
 
@@ -43,18 +43,18 @@ class View:
     height: float = EYE
     """Metres from the ground to the camera."""
     pitch: float = PITCH
-    """Degrees by which it looks up."""
+    """Degrees the camera looks up."""
     field: Annotated[float, limited(10, 150)] = 80.0
-    """Degrees from its left border to the right."""
+    """Horizontal field of view in degrees."""
     repaint: Repaint = 0.0
-    """Standard deviation of a change of every part's log colour: other paint, other light."""
+    """Standard deviation of a change in each part's log colour: other paint, other light."""
     season: Season = "summer"
     time: Time = "noon"
     weather: Weather = "clear"
     occluders: int | None = None
     """Seed of the cars, buses and people in the street; None leaves it empty."""
     crowd: Annotated[int, limited(0)] = 0
-    """People besides those, where it is not empty."""
+    """Extra people, if the street is not empty."""
     exposure: float = 0.0
     """Exposure in stops."""
     noise: Annotated[float, limited(0, 255)] = 0.0
@@ -81,7 +81,7 @@ class Camera:
     """A pinhole camera in a place."""
 
     def __init__(self, heading: float, view: View, size: tuple[int, int]) -> None:
-        """Place the camera by the default view's heading in degrees, and its size in pixels."""
+        """Place the camera, given the default view's heading in degrees and the size in pixels."""
         self.centre = np.array(size[::-1]) / 2
         self.tan_half_width = np.tan(np.deg2rad(view.field) / 2)
         self.focal = self.centre[0] / self.tan_half_width

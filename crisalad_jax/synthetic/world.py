@@ -1,4 +1,4 @@
-"""A world to learn from: streets, corridors and country, in the layouts of real sets."""
+"""A world to train on: streets, corridors and country, in the layouts of real data sets."""
 
 import dataclasses
 import os
@@ -31,9 +31,9 @@ from crisalad_jax.synthetic.view import (
 )
 
 Variation = Literal["stand", "season", "time", "weather", "traffic", "exposure"]
-"""What changes from image to image of a place, besides paint; exposure has the noise with it.
+"""What varies between the images of a place, in addition to paint; exposure includes the noise.
 
-The sun's place, the clouds and the white balance come of a picture's seed, which always changes.
+The sun's position, the clouds and the white balance follow a picture's seed, which always varies.
 """
 VARIATIONS: tuple[Variation, ...] = get_args(Variation)
 _FIELDS: dict[Variation, tuple[str, ...]] = {
@@ -41,10 +41,10 @@ _FIELDS: dict[Variation, tuple[str, ...]] = {
     "traffic": ("occluders", "crowd"),
     "exposure": ("exposure", "noise"),
 }
-"""Fields of `View` that are one variation, where that is not the field of its name."""
+"""Fields of `View` that belong to a variation, where it is not the field of the same name."""
 _SCENES_PER_CITY = 12
 _SPACING = 100.0
-"""Metres between places in the files, where stations of a scene lie nearer in truth."""
+"""Metres between places as the files give them; stations of a scene are really closer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,22 +52,22 @@ class WorldConfig:
     """Size and seed of a world."""
 
     scenes: PositiveInt = 2400
-    """Scenes to train on, of each kind in turn."""
+    """Training scenes, of each kind in turn."""
     stations: PositiveInt = 4
-    """Places of a scene, one behind the other: they look alike."""
+    """Places of a scene, one behind another; they look similar."""
     images_per_place: PositiveInt = 4
     test_scenes: PositiveInt = 100
-    """Other scenes, with two images of each station: one to find and one to ask with."""
+    """Other scenes, with two images of each station: a database image and a query."""
     image_size: tuple[int, int] = (120, 160)
     """Height and width in pixels."""
     sceneries: tuple[Scenery, ...] = SCENERIES
     repaint: Repaint = 0.3
     """Largest `View.repaint`."""
     varied: tuple[Variation, ...] = VARIATIONS
-    """What changes between the training images of a place. The rest is as in a plain `View`, the
-    stand as the scene's camera. Test images change in all of these."""
+    """What varies between the training images of a place. The rest is as in a plain `View`, the
+    stand as in the scene's camera. Test images vary in all of these."""
     hard: Annotated[float, limited(0, 1)] = 0.3
-    """Share of the images that are taken from far aside, turned, or through a crowd."""
+    """Share of the images taken from far to the side, turned, or through a crowd."""
     seed: Seed = 0
 
     def __post_init__(self) -> None:
@@ -78,15 +78,15 @@ class WorldConfig:
 
     @property
     def images(self) -> int:
-        """Number of all images."""
+        """Total number of images."""
         return (self.scenes * self.images_per_place + self.test_scenes * 2) * self.stations
 
 
 def write_world(root: str | os.PathLike[str], config: WorldConfig, *, quiet: bool = False) -> bool:
-    """Render a world into `root`, whole or not at all.
+    """Render a world into `root`, completely or not at all.
 
-    `root/train` has the layout of GSV-Cities; a city is some scenes of one kind. `root/test` has
-    that of VPR-datasets-downloader. Coordinates are placeholders: places are 100 m apart.
+    `root/train` has the layout of GSV-Cities, each city with some scenes of one kind. `root/test`
+    has that of VPR-datasets-downloader. Coordinates are placeholders: places are 100 m apart.
 
     Args:
         root: a folder that does not exist, or is empty, or holds this world.
@@ -94,7 +94,7 @@ def write_world(root: str | os.PathLike[str], config: WorldConfig, *, quiet: boo
         quiet: no progress bar.
 
     Returns:
-        Whether it was written: False where it was there.
+        Whether it was written; False if it was there already.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
@@ -150,7 +150,7 @@ def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: R
 
 
 def _harden(view: View, reach: Reach, rng: Rng) -> View:
-    """Move the camera far aside and turn it, and let a crowd pass in one of three."""
+    """Move the camera far to the side and turn it, and add a crowd in one of three views."""
     return dataclasses.replace(
         view,
         lateral=rng.uniform(-2.2, 2.2) * reach.lateral,

@@ -14,18 +14,18 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.utils.shapes import Int, Int32
 
 TrainingSet = Places | QuerySet | Mapping[str, Places]
-"""What a run trains on: places, queries of which tuples are mined, or a mixture's sets by name."""
+"""What a run trains on: places, queries to mine tuples for, or a mixture's sets by name."""
 
 
 def sets_of(places: TrainingSet) -> tuple[Places | QuerySet, ...]:
-    """Return the sets of a mixture in the order of their names, or the one without a name."""
+    """Return the sets of a mixture in the order of their names, or the single set."""
     if isinstance(places, Mapping):
         return tuple(places[name] for name in sorted(places))
     return (places,)
 
 
 def prepared_as(config: TrainConfig) -> dict[str, Any]:
-    """Return how a run's images are prepared, as `data.loader` takes it."""
+    """Return how a run's images are prepared, as arguments for `data.loader`."""
     return {
         "image_size": config.model.input_size,
         "preprocessing": config.model.preprocessing,
@@ -42,19 +42,19 @@ class Drawn(NamedTuple):
 
 
 class PlaceBatches:
-    """The batches of places, of one set or of a mixture, or of groups of classes in turn.
+    """The batches of places of one set or a mixture, or of groups of classes in turn.
 
-    The images of a mixture are numbered from one set to the next, and the sub-batches of a batch
+    The images of a mixture are numbered consecutively over its sets, and the sub-batches of a batch
     follow each other.
     """
 
     def __init__(
         self, config: TrainConfig, places: Places | Mapping[str, Places], **reading: Any
     ) -> None:
-        """Divide the places into groups where the loss classifies, and count the steps.
+        """Divide the places into groups if the loss classifies, and count the steps.
 
         Args:
-            config: the run's.
+            config: the run's configuration.
             places: the training set, or those of the mixture by name.
             **reading: how images are read; see `batches_of_groups`.
 
@@ -65,9 +65,9 @@ class PlaceBatches:
         self._runs = config.alone
         sets = (places,) if isinstance(places, Places) else [places[m.name] for m in config.mixture]
         self._turns = (JoinedPlaces(tuple(sets)),)
-        """What epochs train in turn: all sets, or a group of classes."""
+        """What each epoch in turn trains on: all sets, or a group of classes."""
         self.classes: tuple[int, ...] = ()
-        """Number of classes of each group, where the loss classifies."""
+        """Number of classes of each group, if the loss classifies."""
         grouping = config.loss.kind.grouping
         if grouping is not None:
             (places,) = sets
@@ -80,8 +80,8 @@ class PlaceBatches:
             self._turns = tuple(JoinedPlaces((group,)) for group in groups)
             self.classes = tuple(len(group.names) for group in groups)
         self.mined: Drawn | None = None
-        """The epoch that trains now, where it was drawn by descriptors; a run saves it."""
-        # Every set draws once, to find out before the run whether it can. The first has the epoch.
+        """The current epoch, if it was drawn by descriptors; a run saves it."""
+        # Every set draws once, to find out before the run whether it can. The first sets the epoch.
         each_set = zip(self._runs, *(turn.sets for turn in self._turns), strict=True)
         steps, *_ = [_steps(run, *groups) for run, *groups in each_set]
         if grouping is not None and grouping.steps is not None:
@@ -92,7 +92,7 @@ class PlaceBatches:
             self.mined = Drawn(np.array(-1, np.int32), np.zeros(shape, np.int32))
 
     def is_due(self, step: int) -> bool:
-        """Return whether an epoch begins with this step, whose batches take descriptors."""
+        """Return whether this step begins an epoch whose batches are to be drawn by descriptors."""
         begins = step % self.steps_per_epoch == 0
         return self.mined is not None and begins and int(self.mined.step) != step
 
@@ -100,11 +100,11 @@ class PlaceBatches:
         """Draw the batches of the epoch that begins with a step.
 
         Args:
-            step: its first.
-            describe: describes images by the model as it is.
+            step: the first step of the epoch.
+            describe: describes images with the current model.
 
         Returns:
-            What was done, for the user.
+            A message to the user on what was done.
         """
         chosen = self._draw(step // self.steps_per_epoch, describe)
         self.mined = Drawn(np.array(step, np.int32), chosen.astype(np.int32))
@@ -159,7 +159,7 @@ def _draw(run: TrainConfig, places: Places, **how: Any) -> Int[np.ndarray, "step
 
 
 def _steps(run: TrainConfig, *groups: Places) -> int:
-    """Count the steps that take each place of a set about once; of groups, of the longest."""
+    """Count the steps that take each place of a set about once; of groups, those of the longest."""
     if run.sampler.describes:
         (places,) = groups
         run.sampler.check(places)

@@ -1,4 +1,4 @@
-"""Callbacks: what is called with the numbers of a run, and may stop it."""
+"""Callbacks, which receive the numbers of a run and can stop it."""
 
 import csv
 import importlib
@@ -33,9 +33,9 @@ class StopTraining(Exception):
 
 
 class Callback:
-    """A class whose methods are called while a run goes on; by default they do nothing.
+    """A base class whose methods are called during a run; by default they do nothing.
 
-    Where a run was killed, the steps and validations after its last saved state come again.
+    When a killed run resumes, the steps and validations after its last saved state are repeated.
 
     Example:
         >>> class Print(Callback):
@@ -44,7 +44,7 @@ class Callback:
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Check that methods that begin with on_ are known."""
+        """Check that all methods beginning with on_ are known."""
         super().__init_subclass__(**options)
         hooks = [name for name in dir(Callback) if name.startswith("on_")]
         unknown = [name for name in vars(cls) if name.startswith("on_") and name not in hooks]
@@ -55,22 +55,22 @@ class Callback:
         )
 
     def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
-        """Take what the run is.
+        """Handle the start of a run.
 
         Args:
-            out: its folder.
-            config: its configuration.
-            step: number of steps that it has; not 0 where it resumes.
+            out: the run's folder.
+            config: the run's configuration.
+            step: number of steps already taken; not 0 if the run resumes.
         """
 
     def on_step(self, numbers: Numbers) -> None:
-        """Take the numbers of a step, those of its line in metrics.jsonl: step, epoch, loss, ..."""
+        """Handle a step, with the numbers of its line in metrics.jsonl: step, epoch, loss, ..."""
 
     def on_validation(self, numbers: Numbers) -> None:
-        """Take the numbers of a validation, those of its line: step, epoch, R@1, ..."""
+        """Handle a validation, with the numbers of its line: step, epoch, R@1, ..."""
 
     def on_end(self, result: "FitResult") -> None:
-        """Take how the run ended; not called where it ended by an error or a signal."""
+        """Handle the end of a run; not called after an error or a signal."""
 
 
 CALLBACKS: dict[str, type[Callback]] = {}
@@ -79,16 +79,16 @@ _C = TypeVar("_C", bound=type[Callback])
 
 
 def register_callback(name: str) -> Callable[[_C], _C]:
-    """Make a decorator that registers a class of callbacks.
+    """Make a decorator that registers a callback class.
 
     Args:
-        name: what `--callback` calls it.
+        name: the class's name for `--callback`.
 
     Returns:
         The decorator, for a class that inherits from `Callback` and is made without arguments.
 
     Raises:
-        InputError: when it decorates: the name is taken, or it is no such class.
+        InputError: on decoration, if the name is taken, or it is not such a class.
 
     Example:
         >>> @register_callback("print-recall")
@@ -109,7 +109,7 @@ def register_callback(name: str) -> Callable[[_C], _C]:
 
 
 def make_callback(callback: Callback | str) -> Callback:
-    """Return a callback as it is, and make one that is given by its name.
+    """Return a callback unchanged, or make one from its name.
 
     Raises:
         InputError: no such callback, or it needs a package that is not installed.
@@ -125,17 +125,17 @@ def make_callback(callback: Callback | str) -> Callback:
 
 
 class Callbacks:
-    """The callbacks of a run, which the primary process alone calls."""
+    """The callbacks of a run, which only the primary process calls."""
 
     def __init__(self, callbacks: Sequence[Callback | str]) -> None:
-        """Make those that are given by name; raise as `make_callback`."""
+        """Make the callbacks given by name; raises like `make_callback`."""
         made = [make_callback(each) for each in callbacks]
         self._each = made if is_primary() else []
         self.stopped = False
         """Whether one has asked to stop."""
 
     def call(self, method: str, *arguments: Any) -> None:
-        """Call a method of each, in their order."""
+        """Call a method of each, in order."""
         for each in self._each:
             try:
                 getattr(each, method)(*arguments)
@@ -148,7 +148,7 @@ class CsvCallback(Callback):
     """Tables `steps.csv` and `validations.csv` in the run's folder."""
 
     def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
-        """Drop the lines that will come again."""
+        """Drop the lines that the resumed run will repeat."""
         self._out = out
         for name in ("steps", "validations"):
             path = self._path(name)
@@ -171,7 +171,7 @@ class CsvCallback(Callback):
 
 
 def _write_rows(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Append rows, with the columns that the file has, or in a new one those of the first row."""
+    """Append rows with the file's columns or, in a new file, those of the first row."""
     with wrap_os_errors(path), path.open("a+", encoding="utf-8", newline="") as file:
         file.seek(0)
         columns = next(csv.reader(file), [])
@@ -183,9 +183,9 @@ def _write_rows(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 @register_callback("wandb")
 class WandbCallback(Callback):
-    """A run of Weights & Biases, named like the folder; its variables WANDB_... say where.
+    """A run of Weights & Biases, named like the folder; configured by the variables WANDB_....
 
-    A run that resumes is the same there.
+    A run that resumes continues the same one.
     """
 
     def __init__(self) -> None:
@@ -193,7 +193,7 @@ class WandbCallback(Callback):
         self._wandb = _imported("wandb")
 
     def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
-        """Start the run, or go on with that of this folder."""
+        """Start the run, or resume that of this folder."""
         identity = out / "wandb-run"
         if not identity.exists():
             identity.write_text(secrets.token_hex(4), encoding="utf-8")
@@ -213,14 +213,14 @@ class WandbCallback(Callback):
 
 @register_callback("mlflow")
 class MlflowCallback(Callback):
-    """A run of MLflow, named like the folder; its variables MLFLOW_... say where."""
+    """A run of MLflow, named like the folder; configured by the variables MLFLOW_...."""
 
     def __init__(self) -> None:
         """Import the package."""
         self._mlflow = _imported("mlflow")
 
     def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
-        """Start the run, or go on with that of this folder, and log the configuration."""
+        """Start the run, or resume that of this folder, and log the configuration."""
         identity = out / "mlflow-run"
         if identity.exists():
             self._mlflow.start_run(run_id=identity.read_text(encoding="utf-8"))
@@ -230,7 +230,7 @@ class MlflowCallback(Callback):
         self._mlflow.log_dict(to_plain(config), "config.json")
 
     def on_step(self, numbers: Numbers) -> None:
-        """Log the numbers, under the tags that TensorBoard has."""
+        """Log the numbers, under the same tags as for TensorBoard."""
         metrics = {name.replace("@", ""): value for name, value in numbers.items()}
         self._mlflow.log_metrics(metrics, step=int(numbers["step"]))
 
@@ -242,7 +242,7 @@ class MlflowCallback(Callback):
 
 
 def _imported(package: str) -> Any:
-    """Import a package that no extra brings.
+    """Import a package that no extra installs.
 
     Raises:
         InputError: it is not installed.

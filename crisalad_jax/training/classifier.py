@@ -1,4 +1,4 @@
-"""Parameters of a loss, for each group of classes: they train beside the model."""
+"""A loss's own parameters for each group of classes, which train with the model."""
 
 import os
 from typing import NamedTuple
@@ -22,7 +22,7 @@ class Classifiers(NamedTuple):
     """Parameters of all groups, padded to the largest, so that one program trains each."""
 
     weights: PyTree
-    """Leaves have a leading axis of groups. Rows of padding, beyond a group's classes, stay."""
+    """Leaves have a leading axis of groups. Padding beyond a group's classes never changes."""
     optimiser: PyTree
     """Adam's state for each group: a group keeps its moments while others train."""
 
@@ -30,12 +30,12 @@ class Classifiers(NamedTuple):
 def init_classifiers(
     key: PRNGKeyArray | None, loss: Loss, classes: tuple[int, ...], dim: int
 ) -> Classifiers | None:
-    """Initialise a loss's parameters for each group; None where it has none.
+    """Initialise a loss's parameters for each group; return None if it has none.
 
     Args:
         key: draws them.
-        loss: whose parameters they are.
-        classes: number of classes of each group; empty where there are no classes.
+        loss: the loss that has the parameters.
+        classes: number of classes of each group; empty if there are no classes.
         dim: width of a descriptor.
 
     Raises:
@@ -87,9 +87,9 @@ def update_classifiers(
 def load_loss(path: str | os.PathLike[str]) -> tuple[LossConfig, PyTree]:
     """Read the loss that a run trained with, and the parameters that it learnt.
 
-    `load` reads the model of the same file. A run that starts from the file draws the parameters of
-    its loss anew. Those of a loss that classifies, a vector for each class of the training set, are
-    in the run's `state/` alone.
+    `load` reads the model of the same file. A run that starts from the file initialises the
+    parameters of its loss again. Those of a loss that classifies, a vector for each class of the
+    training set, are only in the run's `state/`.
 
     Args:
         path: the `last.safetensors` or `best.safetensors` of a run.

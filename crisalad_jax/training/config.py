@@ -35,7 +35,7 @@ from crisalad_jax.utils.errors import locate_errors
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class OptimiserConfig:
-    """An optimiser, with an optional warm-up and a schedule of the learning rate.
+    """An optimiser with an optional warm-up and a learning-rate schedule.
 
     Example:
         >>> OptimiserConfig(kind="sgd", schedule="cosine", learning_rate=1e-3, warmup_steps=100)
@@ -43,30 +43,30 @@ class OptimiserConfig:
     """
 
     kind: OrName[Optimiser] = part_field(OPTIMISERS, "adamw")
-    """A registered optimiser or its name, or one of optax by its dotted name, such as
+    """A registered optimiser or its name, or the dotted name of one in optax, such as
     optax.contrib.muon."""
     learning_rate: PositiveFloat = 6e-5
-    """Learning rate at its highest: after the warm-up, before it falls."""
+    """Peak learning rate: after the warm-up, before the decay."""
     schedule: OrName[Schedule] = part_field(SCHEDULES, "linear")
     """How the learning rate changes after the warm-up; a registered schedule, or its name."""
     warmup_steps: NonNegativeInt = 0
-    """Steps of a linear warm-up, of which the last is at the learning rate."""
+    """Steps of a linear warm-up, which ends at the learning rate."""
     warmup_epochs: NonNegativeInt = 0
-    """The same in epochs, in place of `warmup_steps`."""
+    """Epochs of warm-up, instead of `warmup_steps`."""
     weight_decay: NonNegativeFloat = 0.01
-    """Torch's default for AdamW; the paper names none. An optimiser without a weight decay of its
-    own gets it through its gradient, as torch's Adam and SGD."""
+    """Torch's default for AdamW; the paper gives none. Optimisers without a weight decay of their
+    own add it to the gradient, as torch's Adam and SGD do."""
     clip_norm: PositiveFloat | None = None
-    """Largest norm of the whole gradient."""
+    """Maximum norm of the whole gradient."""
     clip_value: PositiveFloat | None = None
-    """Largest absolute value of each number of the gradient, after `clip_norm`."""
+    """Maximum absolute value of a gradient element, after `clip_norm`."""
     accumulate: PositiveInt = 1
-    """Number of batches whose gradients are averaged for one step of the optimiser. The steps above
-    are these. As in Lightning, the last batch of an epoch steps too; the sum of the gradients that
-    are left is divided by the same number."""
+    """Number of batches whose gradients are averaged for one optimiser step. The steps above count
+    these. As in Lightning, the last batch of an epoch also steps; the sum of the remaining
+    gradients is divided by the same number."""
     ema: Fraction | None = None
-    """Decay of an exponential moving average of the weights, such as 0.999, in a step of the
-    optimiser; validations and saved weights are of the average. None has no average."""
+    """Decay of an exponential moving average of the weights per optimiser step, such as 0.999;
+    validation and saved weights use the average. None turns it off."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
@@ -78,11 +78,11 @@ class OptimiserConfig:
 @short_repr(switch=("kind", "none"))
 @dataclasses.dataclass(frozen=True)
 class MiningConfig:
-    """Tuples of a query, its nearest positive and its hardest negatives, by the model as it is.
+    """Mining of tuples: a query, its nearest positive and its hardest negatives.
 
-    An epoch is a number of rounds. Each begins by describing images, and then trains on a tuple of
-    each of its queries. Positives and negatives are database images, by their positions; where a
-    set has none, by its ground truth.
+    An epoch consists of rounds. Each round describes images with the current model, then trains on
+    one tuple per query. Positives and negatives are database images, chosen by position, or by
+    ground truth if the set has no positions.
 
     Example:
         >>> MiningConfig(kind="whole", negatives=5).candidates
@@ -90,24 +90,24 @@ class MiningConfig:
     """
 
     kind: Literal["none", "whole", "sample"] = "none"
-    """What is described: nothing, for training sets of places; the "whole" database, of which each
-    query draws candidates of its own, and keeps its last negatives among them (NetVLAD); or a
-    "sample" of candidates for all queries of the round, and their positives (MSLS)."""
+    """What is described: nothing, for training sets of places; the "whole" database, from which
+    each query draws its own candidates, plus its previous negatives (NetVLAD); or a "sample" of
+    candidates for all queries of the round, and their positives (MSLS)."""
     negatives: PositiveInt = 10
-    """Negatives of a tuple, the nearest of the candidates."""
+    """Negatives per tuple: the nearest candidates."""
     candidates: PositiveInt = 1000
-    """Number of database images that are drawn for the negatives."""
+    """Number of database images drawn as candidate negatives."""
     queries_per_round: PositiveInt = 1000
-    """Most queries of a round; the queries of an epoch make rounds of equal size."""
+    """Maximum queries per round; an epoch is divided into rounds of equal size."""
     queries_per_epoch: PositiveInt | None = None
-    """Queries of an epoch, drawn anew for each round; None takes every query at most once."""
+    """Queries per epoch, redrawn for each round; None takes every query at most once."""
     positive_radius: float = 10.0
     """Metres within which a database image is a query's positive."""
     negative_radius: float = 25.0
-    """Metres within which a database image is no negative."""
+    """Metres within which an image is not a negative."""
     margin: PositiveFloat | None = None
-    """Only negatives enter that are at most so much farther than the positive; None takes the
-    hardest in any case."""
+    """Use only negatives at most this much farther than the positive; None always takes the
+    hardest."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
@@ -121,7 +121,7 @@ class MiningConfig:
 @short_repr("name")
 @dataclasses.dataclass(frozen=True)
 class MixtureSet:
-    """One of several training sets that are trained on together: its sub-batch of each step.
+    """One of several training sets that are trained on together, with its sub-batch of each step.
 
     Example:
         >>> MixtureSet("msls", sampler="cliques", weight=0.5)
@@ -129,16 +129,16 @@ class MixtureSet:
     """
 
     name: str
-    """Name of the set, with which its data are given, and its loss is logged: letters, digits and
+    """Name of the set, used to pass its data and to log its loss: letters, digits and
     underscores."""
     sampler: OrName[Sampler] = part_field(SAMPLERS, "within-city")
     """Which of its places make a sub-batch; a registered sampler, or its name."""
     loss: LossConfig = LossConfig()
-    """Loss of the sub-batch, of pairs within it alone."""
+    """Loss of the sub-batch, over its own pairs only."""
     share: PositiveInt = 1
-    """Part of the batch's places, relative to the other sets' shares."""
+    """Share of the batch's places, relative to the other sets."""
     weight: PositiveFloat = 1.0
-    """Factor of its loss in the sum of all."""
+    """Weight of its loss in the sum."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
@@ -150,7 +150,7 @@ class MixtureSet:
 @short_repr("model", "loss")
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """A whole training run, apart from where its files lie.
+    """Configuration of a training run, except for the paths of its files.
 
     Example:
         >>> from crisalad_jax import PRESETS
@@ -163,56 +163,55 @@ class TrainConfig:
     optimiser: OptimiserConfig = OptimiserConfig(
         schedule=LinearSchedule(end_fraction=0.2, decay_steps=4000)
     )
-    """By default AdamW as in the paper, whose decay is "as adopted in SALAD": to 0.2 in 4,000
-    steps."""
+    """By default the paper's AdamW, with a decay "as adopted in SALAD": to 0.2 in 4,000 steps."""
     trainable: str = ADAPTERS_AND_HEAD
-    """What is not frozen, a comma list: adapters,head (the paper); last-N-blocks,norm,head (SALAD);
-    all; or patterns of names, as in adapters,head,backbone.blocks.1[01]. With - before it a word or
-    pattern is frozen, as in head,-adapters; see `split_params`."""
+    """What trains, a comma list: adapters,head (the paper); last-N-blocks,norm,head (SALAD); all;
+    or patterns of names, as in adapters,head,backbone.blocks.1[01]. A leading - freezes a word or
+    pattern, as in head,-adapters; see `split_params`."""
     batch_norm: Literal["batch", "stored"] = "batch"
     """Statistics of the backbone's batch norms. "batch" normalises by those of the batch and
-    updates the running ones (torch's `train()`, of frozen layers too). "stored" leaves the running
-    ones as they are and normalises by them (`eval()`)."""
+    updates the running ones (torch's `train()`, in frozen layers too). "stored" normalises by the
+    running ones without updating them (`eval()`)."""
     augmentation: OrName[Augmentation] = part_field(AUGMENTATIONS, "rand-augment")
     """How training images are changed; a registered augmentation, or its name."""
     places_per_batch: PositiveInt = 48
-    """Number of places in a batch; where the loss classifies, of classes."""
+    """Number of places in a batch, or of classes if the loss classifies."""
     images_per_place: PositiveInt = 4
-    """Number of images of each of them."""
+    """Number of images of each."""
     micro_batch: int | None = None
-    """So many images' activations are in memory at a time: a step takes less of it and a forward
-    pass longer, and is the same; of a convolutional backbone on a CPU ten times as long and more,
-    for XLA's loops have no fast convolutions. None is the whole batch. Batch norms that follow the
-    batch take the statistics of so many images alone, as in several forward passes of torch's."""
+    """Images whose activations are in memory at a time: a step needs less memory but a longer
+    forward pass, with the same result. On a CPU a convolutional backbone takes ten times as long or
+    more: XLA's loops have no fast convolutions. None is the whole batch. With "batch" statistics,
+    batch norms use those of each micro-batch, as in several forward passes of torch."""
     min_images: int = 4
     """Places, or classes, with fewer images are left out."""
     mining: MiningConfig = MiningConfig()
-    """Tuples of a set of queries, in the place of places. Then `places_per_batch` tuples make a
-    batch, each of `images_per_place` images: a query, a positive, and the negatives."""
+    """Tuples of a set of queries, instead of places. A batch is then `places_per_batch` tuples,
+    each of `images_per_place` images: a query, a positive, and the negatives."""
     sampler: OrName[Sampler] = part_field(SAMPLERS, "within-city")
     """Which places make a batch; a registered sampler, or its name."""
     mixture: tuple[MixtureSet, ...] = ()
-    """Several training sets, in the place of one with `sampler` and `loss`. Each step takes a
-    sub-batch of each, computes the loss of each by itself, and adds them. Images attend to those of
-    their sub-batch. An epoch is one of the first set."""
+    """Several training sets, instead of one with `sampler` and `loss`. Each step takes a sub-batch
+    of each, computes its loss separately, and adds the losses. Images attend only within their
+    sub-batch. The first set determines the epoch."""
     cities: tuple[str, ...] | None = None
-    """Which cities; None takes all."""
+    """Cities to use; None is all."""
     epochs: PositiveInt = 8
-    """Passes over the training set; more than a run in the folder has extend it. The paper
-    converged within five, and stopped after three without gain."""
+    """Passes over the training set; a larger number extends an existing run. The paper converged
+    within five, and stopped after three without gain."""
     validate_every: PositiveInt = 1
     """Epochs from one validation to the next."""
     validation_size: tuple[int, int] | None = None
-    """Height and width that validations resize to; None is the model's. The model that is saved has
-    its own."""
+    """Height and width that validations resize to; None is the model's. The saved model keeps its
+    own."""
     monitor: Literal["R@1", "R@5", "R@1+R@5"] = "R@5"
-    """Recall of a validation that tells which weights are the best."""
+    """Validation recall that selects the best weights."""
     patience: PositiveInt | None = 3
-    """Validations without a better recall after which training stops; None never stops early."""
+    """Validations without a better recall before training stops; None never stops early."""
     save_top_k: PositiveInt = 1
-    """So many validations' weights are kept, those of the best recall."""
+    """Number of validations whose weights are saved, by best recall."""
     seed: Seed = 0
-    """Draws weights, batches and augmentations."""
+    """Seeds weights, batches and augmentations."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
@@ -248,7 +247,7 @@ class TrainConfig:
             self.model.check_image_size(self.validation_size)
 
     def _check_mixture(self) -> None:
-        """Check the sets of the mixture, each as a run of its own, and what they share."""
+        """Check each set of the mixture as a separate run, and what the sets share."""
         names = [each.name for each in self.mixture]
         require(
             len(set(names)) == len(names),
@@ -276,11 +275,11 @@ class TrainConfig:
 
     @property
     def alone(self) -> tuple["TrainConfig", ...]:
-        """Each set of the mixture as a run of its own; without a mixture the run itself."""
+        """Each set of the mixture as a separate run; without a mixture, the run itself."""
         shares = sum(each.share for each in self.mixture)
         found = []
         for number, each in enumerate(self.mixture):
-            # Sets of the same places draw other batches.
+            # Two sets of the same places draw different batches.
             words = np.random.SeedSequence(self.seed, spawn_key=(number,)).generate_state(1)
             with locate_errors(f"mixture.{each.name}: "):
                 one = dataclasses.replace(
@@ -296,7 +295,7 @@ class TrainConfig:
         return tuple(found) or (self,)
 
     def with_each(self, **changes: Callable[[Any], Any]) -> "TrainConfig":
-        """Change the sampler or the loss by functions: the run's, or those of every set."""
+        """Apply functions to the sampler or the loss: the run's, or those of every set."""
 
         def changed(each: Any) -> Any:
             values = {name: change(getattr(each, name)) for name, change in changes.items()}
@@ -308,12 +307,12 @@ class TrainConfig:
 
     @property
     def mines(self) -> bool:
-        """Whether it trains on tuples that are mined, and not on places."""
+        """Whether the run trains on mined tuples instead of places."""
         return self.mining.kind != "none"
 
     @property
     def min_images_of_place(self) -> int:
-        """Smallest number of images of a place; 1 where images are regrouped."""
+        """Smallest number of images of a place; 1 if images are regrouped."""
         grouping = self.loss.kind.grouping
         to_classes = grouping is not None and grouping.kind != "places"
         return 1 if to_classes or self.sampler.regroups else self.min_images
@@ -323,5 +322,5 @@ DEFAULT_SAMPLER = SAMPLERS.make("within-city")
 
 
 def has_adapters(model: ModelConfig) -> bool:
-    """Return whether a model's backbone has adapters, or what else it says is to be trained."""
+    """Return whether a model's backbone has adapters, or other parts that it marks as trainable."""
     return bool(model.backbone.trains)

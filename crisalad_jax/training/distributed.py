@@ -1,6 +1,6 @@
 """Coordinate one training run in several processes, on one host or many (`jax.distributed`).
 
-All processes run the same program. Process 0 is the primary: it alone reads and writes the run's
+All processes run the same program. Process 0 is the primary: only it reads and writes the run's
 folder.
 """
 
@@ -32,21 +32,21 @@ def join_processes(
 ) -> None:
     """Join a group of processes, before JAX is used for anything else.
 
-    On CPUs each process has one device. With several, whose threads wait for other processes, the
-    group could deadlock. On GPUs each process of a host has one too; see `local_device_ids`.
+    On CPUs each process has one device: with several, whose threads wait for other processes, the
+    group could deadlock. On GPUs each process of a host also has one; see `local_device_ids`.
 
     Args:
-        coordinator: HOST:PORT of process 0, where all can reach it; or "auto" under what JAX knows
-            to ask (Slurm, Open MPI, Kubernetes, Cloud TPU), for the other two as well.
-        count: how many there are.
-        index: which this is, from 0.
-        local_device_ids: numbers of this host's GPUs that are this process's. By default the one of
-            the process's number on its host, where a launcher tells it (Slurm, Open MPI), where
-            all processes are on one host (a coordinator at localhost), or with "auto". Otherwise,
-            or where the process sees one GPU alone, all that it sees.
+        coordinator: HOST:PORT of process 0, reachable from all; or "auto" if JAX can query the
+            environment (Slurm, Open MPI, Kubernetes, Cloud TPU), also for `count` and `index`.
+        count: number of processes.
+        index: number of this process, from 0.
+        local_device_ids: numbers of this process's GPUs on its host. By default, the process's own
+            number on the host, if a launcher gives it (Slurm, Open MPI), if all processes are on
+            one host (a coordinator at localhost), or with "auto". Otherwise, or if the process sees
+            only one GPU, all that it sees.
 
     Raises:
-        InputError: the arguments do not fit each other, or the others cannot be met.
+        InputError: the arguments do not fit each other, or the others cannot be reached.
     """
     is_valid = count is None and index is None
     if coordinator != "auto":
@@ -76,7 +76,7 @@ def join_processes(
         )
         given["local_device_ids"] = list(local_device_ids)
     jax.config.update("jax_num_cpu_devices", 1)
-    # JAX's own handler of SIGTERM would hide the signal from this program.
+    # JAX's own SIGTERM handler would hide the signal from this program.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(**given, heartbeat_timeout_seconds=HEARTBEAT)
@@ -97,34 +97,34 @@ _VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES
 
 
 def _own_device(coordinator: str, index: int) -> list[int] | None:
-    """Return the number of the GPU that is this process's alone; None where nothing tells it.
+    """Return the number of this process's own GPU; None if it cannot be determined.
 
-    Each process would otherwise claim the memory of all GPUs of its host.
+    Without it, each process would claim the memory of all GPUs of its host.
     """
     if os.environ.get("JAX_LOCAL_DEVICE_IDS"):
-        return None  # which JAX reads
+        return None  # JAX reads it
     if any(len(os.environ[name].split(",")) == 1 for name in _VISIBLE if os.environ.get(name)):
-        return None  # it was given its GPU, which has the number 0 here
+        return None  # it was assigned a GPU, which has the number 0 here
     host = coordinator.rpartition(":")[0].strip("[]")
     if host in ("localhost", "::1") or host.startswith("127."):
         return [index]
     for number, local in _LAUNCHED:
-        # A shell that the launcher began has numbers too, which are not those of its processes.
+        # A shell started by the launcher has numbers too, which are not those of its processes.
         if os.environ.get(number) == str(index) and os.environ.get(local, "").isdecimal():
             return [int(os.environ[local])]
     return None
 
 
 def _check_port(address: str) -> None:
-    """Check that process 0 can listen at this address: JAX would end the process without a word.
+    """Check that process 0 can listen at this address; otherwise JAX would exit without a message.
 
     Raises:
         InputError: it cannot.
     """
     host, _, port = address.rpartition(":")
     try:
-        socket.getaddrinfo(host.strip("[]"), None)  # JAX would wait for minutes for no such host
-        # JAX listens at this port of all interfaces.
+        socket.getaddrinfo(host.strip("[]"), None)  # JAX would wait minutes for an unknown host
+        # JAX listens at this port on all interfaces.
         with socket.socket(socket.AF_INET) as listener:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(("", int(port)))
@@ -141,7 +141,7 @@ def is_primary() -> bool:
 
 
 def run_on_primary(work: Callable[[], _T]) -> _T:
-    """Run `work` in the primary process alone; return its value, a JSON value, in every process.
+    """Run `work` only in the primary process; return its value, a JSON value, in every process.
 
     Raises:
         InputError, Interrupted: in every process, as `raise_together` does.
@@ -157,20 +157,20 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
 
 
 def broadcast(tree: _T) -> _T:
-    """Return the primary process's arrays in every process; all give arrays of the same shapes."""
+    """Return the primary process's arrays in every process; all pass arrays of the same shapes."""
     return tree if jax.process_count() == 1 else multihost_utils.broadcast_one_to_all(tree)
 
 
 def all_max(*numbers: int) -> tuple[int, ...]:
-    """Return the largest number of all processes in each place; below 2**32, from 0."""
+    """Return the maximum over all processes of each number, from 0 and below 2**32."""
     return tuple(_gather(*numbers).max(axis=0).tolist())
 
 
 def check_same(numbers: Mapping[str, int]) -> None:
-    """Check that all processes give the same numbers, named for messages.
+    """Check that all processes pass the same numbers, named for messages.
 
     Raises:
-        InputError: they do not, in every process.
+        InputError: in every process, if they do not.
     """
     gathered = _gather(*numbers.values())
     is_other = gathered != gathered[0]
@@ -196,7 +196,7 @@ def raise_together(work: Callable[[], _T]) -> _T:
 
     Raises:
         Interrupted: a signal has ended it, here or in another process.
-        InputError: it failed in another process. In that one, its own error.
+        InputError: it failed in another process, which raises its own error.
     """
     error, value, code = None, None, 0
     try:
@@ -216,5 +216,5 @@ def raise_together(work: Callable[[], _T]) -> _T:
 
 
 def failed_elsewhere(process: int) -> InputError:
-    """Make the error of the processes other than the one that failed."""
+    """Make the error that the processes other than the failed one raise."""
     return InputError(f"processes: process {process} failed; see what it says")

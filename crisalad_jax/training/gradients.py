@@ -1,4 +1,4 @@
-"""Norms of the gradient of a batch's loss, part by part."""
+"""Norms of the gradient of a batch's loss, by part of the model."""
 
 import dataclasses
 import functools
@@ -47,9 +47,9 @@ def gradient_norms(
     Args:
         params: the whole model.
         images: a batch, as `training_batches` yields it.
-        labels: number of the place of each image.
-        config: the run's; another `trainable`, such as "all", shows other parts.
-        key: draws the dropout, and the parameters of a loss that has some; None is without dropout.
+        labels: the place number of each image.
+        config: the run's configuration; another `trainable`, such as "all", shows other parts.
+        key: draws the dropout, and the loss's parameters, if it has any; None disables dropout.
 
     Returns:
         Euclidean norms by name, in the order of the model: `backbone.blocks.3` for a block,
@@ -58,8 +58,8 @@ def gradient_norms(
         that do not train are left out.
 
     Raises:
-        InputError: what `init_train_state` and the step of `make_train_step` raise; a loss that
-            classifies is refused, for its classes are a run's.
+        InputError: what `init_train_state` and the step of `make_train_step` raise; or the loss
+            classifies, because its classes belong to a run.
 
     Example:
         >>> import jax, numpy as np
@@ -98,7 +98,7 @@ def _squares(
     key: PRNGKeyArray | None,
     config: StepConfig,
 ) -> tuple[Any, Float[Array, ""]]:
-    """Sum the squares of the gradient along all axes but the first, and those of the loss's own."""
+    """Sum the squared gradient over all axes but the first, and that of the loss's parameters."""
     valid = jnp.ones(len(labels), bool)
     _, (gradient, of_loss) = loss_and_gradient(state, frozen, images, labels, valid, key, config)
     whole = eqx.combine(gradient, jax.tree.map(jnp.zeros_like, frozen))
@@ -111,7 +111,7 @@ def _squares(
 
 
 def _part_of(name: str, adapters: list[str]) -> str:
-    """Return the part that a parameter belongs to, by its name with the number of its block."""
+    """Return the part that a parameter belongs to, from its name with its block's number."""
     parts = name.split(".")
     for pattern in adapters:
         part = ".".join(parts[: 1 + pattern.count(".")])

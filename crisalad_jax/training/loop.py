@@ -51,7 +51,7 @@ from crisalad_jax.utils.shapes import Float
 from crisalad_jax.utils.signals import SignalState, defer_signals, watch
 
 STATUS_STEPS = 5
-"""Several processes exchange their status before every so many steps of a round."""
+"""Number of steps of a round between exchanges of status among several processes."""
 _T = TypeVar("_T")
 
 
@@ -63,7 +63,7 @@ class FitResult(NamedTuple):
     """Parameters after the last step."""
     steps: int
     best_recall: float | None
-    """Best recall of a validation, a fraction, by `TrainConfig.monitor`; None without one."""
+    """Best validation recall, a fraction, by `TrainConfig.monitor`; None without one."""
     stopped_early: bool
     """Whether it ended before its last epoch, by `TrainConfig.patience` or by a callback."""
     skipped_images: int
@@ -87,50 +87,50 @@ def fit(
     quiet: bool = False,
     targets: Float[np.ndarray, "image target"] | None = None,
 ) -> FitResult:
-    """Train, or resume the run that `out` holds, and leave its files there.
+    """Train a model, or resume the run in `out`, and write its files there.
 
     The files are: `config.json`; `metrics.jsonl`, a line for each step and each validation, and the
     same for TensorBoard in `tensorboard/`; `state/`, the checkpoint that a later call resumes from;
-    and `last.safetensors`, the weights, with what the loss learnt (`load_loss`). A validation adds
-    `best.safetensors`, the weights of the best recall by `config.monitor` (grouping `single`), and
-    the best `config.save_top_k` weights in `best/`.
+    and `last.safetensors`, the weights, with the loss's learnt parameters (`load_loss`). A
+    validation adds `best.safetensors`, the weights of the best recall by `config.monitor` (grouping
+    `single`), and the best `config.save_top_k` weights in `best/`.
 
-    A run in `out` of fewer epochs is extended: it goes on to those of `config`, which may differ in
-    nothing else. If the learning rate depends on the run's length, a note says how it jumps.
+    A run in `out` with fewer epochs is extended to those of `config`, which must be the same
+    otherwise. If the learning rate depends on the run's length, a warning says where it jumps.
 
-    A run that is killed at any moment and resumed ends with the same bits as an uninterrupted one
-    (on a CPU; see docs/reliability.md for a GPU).
+    A run that is killed at any moment and resumed gives bit-identical results to an uninterrupted
+    one (on a CPU; see docs/reliability.md for a GPU).
 
     Args:
-        config: everything but the files.
-        places: training images; a `QuerySet` where `config.mining` mines tuples; or the sets of
+        config: everything except the files.
+        places: training images; a `QuerySet` if `config.mining` mines tuples; or the sets of
             `config.mixture`, by name.
         out: folder of the run.
         validation: evaluated every `config.validate_every` epochs, for early stopping.
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them; validations
             leave them out.
-        num_threads: number of those threads; None is one for each core that this process may use.
-        shard_state: keep what trains and its moments in shards, one a device, not whole on each.
-        cache_gb: most gigabytes (1e9 bytes) of images at addresses that are cached on this host's
-            disk, in the folder `images` of this package's cache; 0 caches none.
+        num_threads: threads that decode images; None is one per core that this process may use.
+        shard_state: shard what trains and its moments over devices, instead of replicating them.
+        cache_gb: maximum gigabytes (1e9 bytes) of remote images cached on this host's disk, in the
+            folder `images` of this package's cache; 0 caches none.
         callbacks: called with the numbers of each step and validation, in the primary process; or
-            names of registered ones. `StopTraining` of one ends the run, and the same call resumes
-            it.
+            names of registered ones. If one raises `StopTraining`, the run ends; the same call
+            resumes it.
         quiet: no progress bar.
-        targets: a teacher's unit descriptor of each image of `places`, perhaps a memory map, for a
-            loss that learns from them; zeros leave an image out.
+        targets: a teacher's unit descriptor of each image of `places`, possibly a memory map, for a
+            loss that learns from them; an image with zeros is left out.
 
     Returns:
-        How the run ended.
+        The final parameters, and how the run ended.
 
     Raises:
-        InputError: nothing of the model trains; an argument is out of range; the validation has no
+        InputError: nothing in the model trains; an argument is out of range; the validation has no
             ground truth; `out` holds something else, or a run of another configuration or start; an
             image cannot be read; there are too few places, classes or images; the loss is no longer
             finite (the state before that step is saved); a file cannot be written; or another
-            process of the run is lost (then this one ends without a wait at its end).
-        Interrupted: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
+            process of the run is lost (this one then ends without waiting for the others).
+        Interrupted: SIGTERM or Ctrl-C was received (in the main thread); the state is saved.
 
     Example:
         >>> import dataclasses
@@ -167,13 +167,13 @@ def fit(
         "validation": 0 if validation is None else checksum_of_benchmark(validation),
         "weights": checksum(jax.tree.leaves(initial)),
     } | ({} if targets is None else {"targets": checksum(targets)})
-    # What does not fit raises in all processes, before the first file is written.
+    # A mismatch raises in all processes, before the first file is written.
     part = jax.process_index(), jax.process_count()
     configuration = checksum_of_config(config)
     distributed.check_same(
         {"configuration": configuration, "--shard-state": shard_state, **checksums}
     )
-    # Each may fail in one process alone: at an address, or at its host's disk.
+    # Each may fail in a single process: at an address, or on its host's disk.
     if part[1] > 1:
         sizes = distributed.raise_together(lambda: checksum_of_sizes(places))
         distributed.check_same({"sizes of images": sizes})
@@ -193,7 +193,7 @@ def fit(
         state = files.load(RunState(trainer.state, data.mined))
         trainer.resume(state.training)
         data.mined = jax.tree.map(np.asarray, state.mined)
-        del state  # whose arrays the trainer has copied
+        del state  # the trainer has copied its arrays
         steps, done = data.steps_per_epoch * config.epochs, files.record.step
         called.call("on_start", files.out, config, done)
         called.stopped = bool(*distributed.all_max(called.stopped))
@@ -212,7 +212,7 @@ def fit(
 
 
 def _reader(places: TrainingSet, cache_gb: float) -> Callable[[Any], bytes]:
-    """Return what reads images at addresses, from this host's disk where it has them."""
+    """Return the reader of remote images, which takes cached ones from this host's disk."""
     if cache_gb == 0 or not any(is_remote(each.root) for each in sets_of(places)):
         return read_remote
     return FileCache(user_cache() / "images", cache_gb * 1e9).read
@@ -232,10 +232,10 @@ class _Loop:
     callbacks: Callbacks
 
     def train(self, steps: int) -> None:
-        """Take the steps that are left of so many; at an interruption, save the state."""
+        """Take the remaining steps up to `steps`; save the state when interrupted."""
         try:
             self._take_rounds(steps)
-            # A signal may have come while the last validation was saved.
+            # A signal may have arrived while the last validation was saved.
             (number,) = distributed.all_max(self.signals.number)
             if number:
                 raise Interrupted(number)
@@ -248,7 +248,7 @@ class _Loop:
             raise Interrupted(stopped.number, where) from None
 
     def _take_rounds(self, steps: int) -> None:
-        """Take rounds, with a validation or a mining before each that needs it.
+        """Take all rounds, and validate or mine before each one that needs it.
 
         A round is an epoch, or the part of one for which tuples are mined together.
         """
@@ -264,11 +264,11 @@ class _Loop:
             self._take_round()
 
     def _take_round(self) -> None:
-        """Take the steps that are left of a round, each started before the last one is logged.
+        """Take the remaining steps of a round, each started before the previous one is logged.
 
-        One process looks at its status before each step. Several exchange theirs every few steps,
-        and do not wait for each other in between: one that has failed goes on with batches of no
-        images until all know it.
+        A single process checks its status before each step. Several exchange theirs every few
+        steps, and do not wait for each other in between: one that has failed continues with batches
+        of no images until all know.
         """
         step, per_round = self.files.record.step, self.data.steps_per_round
         every = STATUS_STEPS if jax.process_count() > 1 else 1
@@ -295,20 +295,20 @@ class _Loop:
                         return
                 watch()
                 self.trainer.start_step(batch, waited)
-                self.signals.has_work = True  # before it, XLA compiles the step
+                self.signals.has_work = True  # XLA has compiled the step by now
                 attempt(lambda: self._log_steps(leave=1))
             attempt(self._log_steps)
             self._exchange_status(error)
 
     def _exchange_status(self, error: Exception | None) -> None:
-        """Act on what any process knows: raise an error or a signal, or save."""
+        """Act on the status of all processes: raise an error or a signal, or save."""
         own = 0 if error is None else 1 if isinstance(error, LossNotFiniteError) else 2
         where = jax.process_index() if own else 0
         failed, number, save_is_due, stopped, where = distributed.all_max(
             own, self.signals.number, self.files.save_is_due(), self.callbacks.stopped, where
         )
         if failed:
-            # Where all have found that the loss is not finite, all raise that, and save together.
+            # If all have found that the loss is not finite, all raise that, and save together.
             another = distributed.failed_elsewhere(where)
             raise error if error is not None and own == failed else another
         self.callbacks.stopped = bool(stopped)
@@ -320,7 +320,7 @@ class _Loop:
             self.save()
 
     def _log_steps(self, *, leave: int = 0) -> None:
-        """Log the steps that were started but for the last ones; raises as `finish_steps`."""
+        """Log the started steps except the last `leave`; raises like `finish_steps`."""
         record = self.files.record
         for values in self.trainer.finish_steps(leave=leave):
             epoch = record.step // self.data.steps_per_epoch + 1
@@ -334,7 +334,7 @@ class _Loop:
             self.bar.advance(1, note=f"{note}  {values['images_per_second']:.0f} images/s")
 
     def _validate(self) -> RunRecord:
-        """Log the recalls, save the best weights, and decide on an early stop."""
+        """Validate: log the recalls, save the best weights, and decide whether to stop early."""
         record = self.files.record
         epoch = record.step // self.data.steps_per_epoch
         state = self.trainer.state
@@ -358,7 +358,7 @@ class _Loop:
         return self.files.record
 
     def _mine(self) -> None:
-        """Draw the batches of the round that begins by the model as it is."""
+        """Draw the batches of the round that begins, with the current model."""
         trainable = self.trainer.gather(self.trainer.state.trainable)
 
         def mine() -> str:

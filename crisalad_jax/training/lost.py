@@ -1,8 +1,8 @@
-"""End a process of a run in one line where another one is lost: killed, or with its host.
+"""End a process with a one-line error if another one of its run is lost, alone or with its host.
 
-JAX ends the others in one of two ways. An exchange raises an error, where the kernel of the lost
-one's host closes its connections; or JAX's service misses its heartbeats, and aborts each process
-in C++, with a page of its own, wherever that is.
+JAX ends the others in one of two ways. An exchange raises an error, if the kernel of the lost
+process's host closes its connections; or JAX's service misses its heartbeats, and aborts each
+process in C++, at any point, with a page of messages.
 """
 
 import atexit
@@ -23,7 +23,7 @@ _T = TypeVar("_T")
 HEARTBEAT = 60
 """Seconds without a heartbeat after which a process counts as lost."""
 _OF_EXCHANGES = re.compile(r"gloo|nccl|coordination service|connection (reset|closed)", re.I)
-"""What JAX's error says where another process has left an exchange."""
+"""What JAX's error says when another process has left an exchange."""
 _NEXT = "the same command resumes from the last saved state, with as many processes or others"
 _FILTER = """
 import re, sys
@@ -45,9 +45,9 @@ _filters: list[subprocess.Popen[bytes]] = []
 
 
 def filter_aborts() -> None:
-    """Let a small program write to standard error what C++ writes, and a line for JAX's page.
+    """Filter C++ output through a small program, which replaces JAX's page with one line.
 
-    What Python writes goes where it went before.
+    All of it goes to standard error; Python's own output goes where it went before.
     """
     program = subprocess.Popen(
         [sys.executable, "-ISc", _FILTER, _NEXT], stdin=subprocess.PIPE, start_new_session=True
@@ -55,7 +55,7 @@ def filter_aborts() -> None:
     assert program.stdin is not None
     for number, stream in ((1, sys.stdout), (2, sys.stderr)):
         stream.flush()
-        # The stream stays the same object, which others hold. Without a buffer, it is the file.
+        # The stream stays the same object, which others hold. Unbuffered, it is the file itself.
         file: Any = getattr(stream.buffer, "raw", stream.buffer)
         file.__init__(os.dup(number), "w", closefd=False)
         os.dup2(program.stdin.fileno(), number)
@@ -64,10 +64,10 @@ def filter_aborts() -> None:
 
 
 def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Wrap a function that processes call together: where one is lost the others raise.
+    """Wrap a function that processes call together: if one is lost, the others raise.
 
-    What the function holds is closed first, so that a state that is being written is whole. This
-    process then ends without JAX's farewell to the others, which would wait for the lost one.
+    What the function holds is closed first, so that a state being written is complete. This process
+    then exits without JAX's shutdown, which would wait for the lost one.
 
     Raises:
         InputError: in place of JAX's error of an exchange with another process.
@@ -82,7 +82,7 @@ def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
             is_lost = jax.process_count() > 1 and _OF_EXCHANGES.search(text)
             if isinstance(error, InputError) or not is_lost:
                 raise
-            for program in _filters:  # the line is said here
+            for program in _filters:  # this process prints the line itself
                 program.kill()
             atexit.register(_leave)
             raise InputError(f"processes: lost another one ({text[:120]}); {_NEXT}") from error

@@ -1,4 +1,4 @@
-"""Mine tuples: a query, its nearest positive and its hardest negatives, by the model as it is.
+"""Mine tuples: a query, its nearest positive and its hardest negatives, by the current model.
 
 NetVLAD's cached hard mining (Arandjelovic et al., CVPR 2016), and the partial mining of Mapillary's
 code and of Berton et al. (CVPR 2022), which Patch-NetVLAD and SelaVPR train with.
@@ -41,12 +41,12 @@ class Miner:
         """Divide an epoch into rounds of whole batches.
 
         Args:
-            config: the run's.
+            config: the run's configuration.
             queries: the training set.
             **reading: how images are read; see `batches_of_groups`.
 
         Raises:
-            InputError: the queries make no batch.
+            InputError: there are too few queries for a batch.
         """
         self._config, self._queries = config, queries
         self._reading = prepared_as(config) | reading
@@ -67,10 +67,10 @@ class Miner:
         none = np.zeros((tuples, config.images_per_place), np.int32)
         hardest = np.full((count, mining.negatives), -1, np.int32)
         self.mined = Mined(np.array(-1, np.int32), none, none, hardest)
-        """Tuples of the round that trains now, which a run saves with its state."""
+        """Tuples of the current round, which a run saves with its state."""
 
     def is_due(self, step: int) -> bool:
-        """Return whether a round begins with this step, whose tuples are not mined yet."""
+        """Return whether this step begins a round whose tuples are not mined yet."""
         return step % self.steps_per_round == 0 and int(self.mined.step) != step
 
     def mine(self, step: int, describe: Describe) -> str:
@@ -78,10 +78,10 @@ class Miner:
 
         Args:
             step: the first step of the round; with the seed it draws candidates.
-            describe: describes images by the model as it is.
+            describe: describes images with the current model.
 
         Returns:
-            How hard the tuples are, for the user.
+            A message to the user on how hard the tuples are.
         """
         mining, queries = self._config.mining, self._queries
         chosen = self._draw_queries(step)
@@ -132,13 +132,13 @@ class Miner:
         to_positives: Float[np.ndarray, " positive"],
         to_candidates: Float[np.ndarray, " candidate"],
     ) -> tuple[Int[np.ndarray, " image"], Int[np.ndarray, " image"]]:
-        """Make a query's tuple by its distances; return its images and their roles."""
+        """Make a query's tuple from its distances; return its images and their roles."""
         mining, queries = self._config.mining, self._queries
         nearest = to_positives.argmin()
         positive = queries.positives[query][nearest]
         farthest = np.inf if mining.margin is None else to_positives[nearest] + mining.margin
         order = np.argsort(to_candidates, kind="stable")[: mining.negatives]
-        images = np.full(2 + mining.negatives, positive)  # which fills what candidates do not
+        images = np.full(2 + mining.negatives, positive)  # fills the places that candidates do not
         roles = np.full(len(images), Role.SPARE)
         images[0], roles[:2] = queries.queries[query], (Role.QUERY, Role.POSITIVE)
         images[2:][: len(order)] = candidates[order]
@@ -159,7 +159,7 @@ class Miner:
         )
 
     def _draw_queries(self, step: int) -> Int[np.ndarray, " tuple"]:
-        """Draw positions of a round's queries: those whose turn it is, or any of all."""
+        """Draw positions of a round's queries: the next of a permutation, or a random sample."""
         count, size = len(self._queries.queries), len(self.mined.images)
         epoch, first = divmod(step, self.steps_per_epoch)
         number = first // self.steps_per_round
@@ -174,7 +174,7 @@ class Miner:
 
 
 Batches = PlaceBatches | Miner
-"""What yields the batches of a run."""
+"""The sources of a run's batches."""
 
 
 def _distances(

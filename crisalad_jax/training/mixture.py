@@ -9,14 +9,14 @@ from crisalad_jax.training.losses import LossConfig
 
 
 def with_sets(config: TrainConfig, names: Sequence[str]) -> TrainConfig:
-    """Fit a configuration to the training sets that are given.
+    """Adapt a configuration to the given training sets.
 
-    Of a mixture those sets are kept, with as many places each. Without one the sets make one: each
-    has the configuration's sampler and loss, and as many places as the others.
+    A mixture is reduced to these sets, each with as many places as before. Without one, the sets
+    form a mixture, with the configuration's sampler and loss and equally many places for each.
 
     Args:
-        config: a recipe's, or an earlier run's.
-        names: names of the sets; none leave it as it is.
+        config: the configuration of a recipe or an earlier run.
+        names: names of the sets; without any, the configuration stays as it is.
 
     Raises:
         InputError: the mixture has no such set, or the configuration's loss is not one of pairs.
@@ -47,13 +47,13 @@ def check_names(
     """Check the names of training sets.
 
     Args:
-        what: the argument that gives them.
-        names: those of the sets that are given.
-        config: the run's; without a mixture no set has a name.
+        what: the argument that gives the names.
+        names: names of the given sets.
+        config: the run's configuration; without a mixture no set has a name.
         least: smallest number of the mixture's sets; None is all.
 
     Raises:
-        InputError: one is not of the mixture, or too few are given.
+        InputError: a name is not in the mixture, or too few are given.
     """
     expected = [each.name for each in config.mixture]
     fits = set(names) <= set(expected) and len(names) >= (len(expected) if least is None else least)

@@ -1,4 +1,4 @@
-"""The optimiser of a run: warm-up, schedule, clipping, shared steps, and an average of weights."""
+"""The optimiser of a run: warm-up, schedule, clipping, accumulation, and an average of weights."""
 
 import dataclasses
 from typing import Any, NamedTuple, TypeVar
@@ -15,18 +15,18 @@ from crisalad_jax.training.schedules import RunSteps
 from crisalad_jax.utils.output import warn
 
 WARMUP_SHARE = 4
-"""Divisor of a run's steps: a warm-up takes a quarter of them at most, as BoQ's 10 of 40 epochs."""
+"""Divisor of a run's steps: a warm-up takes at most a quarter of them, as BoQ's 10 of 40 epochs."""
 
 
 _Count = TypeVar("_Count", int, Array)
 
 
 def count_steps(config: OptimiserConfig, batches: _Count, batches_per_epoch: int) -> _Count:
-    """Count the optimiser's steps in so many batches from the start of a run.
+    """Count the optimiser's steps in the first `batches` batches of a run.
 
     Args:
         config: the optimiser.
-        batches: number of batches, which is also that of the one after them, from 0.
+        batches: number of batches, which is also the index of the next one.
         batches_per_epoch: number of batches of an epoch, the last of which always steps.
 
     Example:
@@ -41,7 +41,7 @@ def count_steps(config: OptimiserConfig, batches: _Count, batches_per_epoch: int
 
 
 def warmup_length(config: OptimiserConfig, steps_per_epoch: int) -> int:
-    """Return the number of the optimiser's steps of a warm-up, which may be given in epochs.
+    """Return the length of a warm-up in optimiser steps, even if it is given in epochs.
 
     Args:
         config: the optimiser.
@@ -69,7 +69,7 @@ def learning_rate_schedule(
         A function of the number of steps that the optimiser has taken (`count_steps`).
 
     Raises:
-        InputError: while tracing, for a schedule that returns no number.
+        InputError: while tracing, for a schedule that does not return a number.
     """
     peak = config.learning_rate
     warmup_steps = warmup_length(config, steps_per_epoch)
@@ -91,12 +91,12 @@ def learning_rate_schedule(
         )
     else:
         schedule = decay
-    # Optax divides its int32 count in float32, also in JAX's 64-bit mode: the count is cast here.
+    # Optax divides its int32 count in float32, even in JAX's 64-bit mode: the count is cast here.
     return lambda count: schedule(jnp.asarray(count, float))
 
 
 def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> OptimiserConfig:
-    """Shorten a warm-up to its largest share of a run.
+    """Shorten a warm-up to the largest allowed share of a run.
 
     Args:
         config: the optimiser.
@@ -104,7 +104,7 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
         steps_per_epoch: number of batches of an epoch.
 
     Returns:
-        The optimiser, as it is where its warm-up is short enough. A shortened one is in steps.
+        The optimiser, unchanged if its warm-up is short enough. A shortened warm-up is in steps.
 
     Example:
         >>> with_short_warmup(OptimiserConfig(warmup_epochs=5), 32, 4).warmup_steps
@@ -117,7 +117,7 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
 
 
 def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> None:
-    """Warn if a warm-up takes more than its largest share of a run's steps."""
+    """Warn if a warm-up takes more than the largest allowed share of a run's steps."""
     short = with_short_warmup(config, steps, steps_per_epoch)
     if short is config:
         return
@@ -134,10 +134,10 @@ def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: in
 def make_optimiser(
     config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
 ) -> optax.GradientTransformation:
-    """Make the optimiser of a run, of `config.kind`.
+    """Make the optimiser of a run, from `config.kind`.
 
-    With `config.clip_norm` or `config.clip_value` the gradient is clipped first, where several
-    batches share a step the mean of theirs. The average of `config.ema` comes last.
+    With `config.clip_norm` or `config.clip_value` the gradient is clipped first (if several batches
+    share a step, their mean gradient). The average of `config.ema` comes last.
 
     Args:
         config: the optimiser.
@@ -145,7 +145,7 @@ def make_optimiser(
         steps_per_epoch: number of batches of an epoch.
 
     Raises:
-        InputError: the optimiser is no transformation of optax.
+        InputError: the optimiser is not an optax transformation.
     """
     schedule, parts = learning_rate_schedule(config, steps, steps_per_epoch), []
     if config.clip_norm is not None:
@@ -170,7 +170,7 @@ def make_optimiser(
 def _accumulated(
     optimiser: optax.GradientTransformation, accumulate: int, batches_per_epoch: int
 ) -> optax.GradientTransformation:
-    """Step once for several batches, and at the last of an epoch."""
+    """Step once every several batches, and at the last batch of an epoch."""
     per_epoch = -(-batches_per_epoch // accumulate)
 
     def count_batches(step: ArrayLike) -> Array:
@@ -186,7 +186,7 @@ def _accumulated(
 
 
 def _with_plain_keys(optimiser: optax.GradientTransformation) -> optax.GradientTransformation:
-    """Keep random keys in the state as numbers, which a checkpoint can hold."""
+    """Store random keys in the state as numbers, which a checkpoint can hold."""
 
     def is_key(leaf: Any) -> bool:
         return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
@@ -216,7 +216,7 @@ class WeightAverage(NamedTuple):
 
 
 def _averaging(decay: float) -> optax.GradientTransformation:
-    """Average the weights after each step, beginning with the first ones."""
+    """Average the weights after each step, starting from the initial ones."""
 
     def init(params: PyTree) -> WeightAverage:
         return WeightAverage(jax.tree.map(jnp.copy, params))  # both are donated to a step
@@ -230,13 +230,13 @@ def _averaging(decay: float) -> optax.GradientTransformation:
 
 
 def averaged_weights(state: PyTree, weights: PyTree) -> PyTree:
-    """Return the weights to validate and save: an average, where the optimiser has one.
+    """Return the weights to validate and save: an average, if the optimiser has one.
 
     It is that of `OptimiserConfig.ema`, or of schedule-free optimisers (Defazio et al. 2024).
 
     Args:
-        state: the optimiser's.
-        weights: those that its last step made.
+        state: the optimiser's state.
+        weights: the weights after its last step.
     """
     from optax.contrib import ScheduleFreeState, schedule_free_eval_params
 

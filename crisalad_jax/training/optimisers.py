@@ -1,4 +1,4 @@
-"""Optimisers: the interface of a new one, the built-in ones, and optax's by their dotted names."""
+"""Optimisers: the interface of custom ones, the built-in ones, and optax's by dotted name."""
 
 import abc
 import dataclasses
@@ -19,15 +19,15 @@ from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.pytree import named_leaves
 
 Rate = Callable[[Any], Any]
-"""A learning rate by the number of the step, as optax takes it."""
+"""A learning rate as a function of the step number, as in optax."""
 _PREFIX = "optax."
 
 
 class Optimiser(Part, abc.ABC):
-    """What turns gradients into steps: a frozen dataclass whose fields are its settings.
+    """An optimiser, as a frozen dataclass whose fields are its settings.
 
-    A plain function of (learning_rate, weight_decay) that returns a transformation of optax is an
-    optimiser without settings. For one of (learning_rate) alone the weight decay is added to the
+    A plain function of (learning_rate, weight_decay) that returns an optax transformation is an
+    optimiser without settings. If it takes only (learning_rate), the weight decay is added to the
     gradient, as in torch's Adam and SGD.
 
     Example:
@@ -42,10 +42,10 @@ class Optimiser(Part, abc.ABC):
 
     @abc.abstractmethod
     def make(self, learning_rate: Rate, weight_decay: float) -> Any:
-        """Return a transformation of optax, which turns gradients into what is added to weights.
+        """Return an optax transformation, which turns gradients into updates of the weights.
 
         Args:
-            learning_rate: takes the number of the optimiser's step, from 0.
+            learning_rate: a function of the optimiser's step number, from 0.
             weight_decay: `OptimiserConfig.weight_decay`.
         """
 
@@ -63,13 +63,13 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
 
 
 _MATRICES = "muon_weight_dimension_numbers"
-"""Argument by which optax's Muon knows matrices, which it orthogonalises, from what Adam updates.
-By itself it takes an array of two axes for one, of three for none."""
+"""Argument that says which arrays optax's Muon orthogonalises as matrices; Adam updates the others.
+By default an array of two axes counts as a matrix, one of three does not."""
 _TOKENS = re.compile(r"token|pos_embed")
 
 
 def _decayed(weight_decay: float, optimiser: Any) -> Any:
-    """Add the weight decay to the gradient first."""
+    """Add the weight decay to the gradient before the optimiser."""
     import optax
 
     return optax.chain(optax.add_decayed_weights(weight_decay), optimiser)
@@ -77,10 +77,10 @@ def _decayed(weight_decay: float, optimiser: Any) -> Any:
 
 @functools.cache
 def _of_optax(name: Any) -> type[Optimiser] | None:
-    """Make the part of a function of optax, whose settings are the function's plain arguments.
+    """Make an optimiser from an optax function, with the function's plain arguments as settings.
 
     Args:
-        name: such as optax.contrib.muon; None is returned for names of other than optax's.
+        name: a name such as optax.contrib.muon; for names outside optax the result is None.
 
     Raises:
         InputError: there is no such function in optax, or it takes no learning rate.
@@ -92,7 +92,7 @@ def _of_optax(name: Any) -> type[Optimiser] | None:
     found: Any = optax
     for part in name.removeprefix(_PREFIX).split("."):
         found = None if part.startswith("_") else getattr(found, part, None)
-    # Modules of optax have other libraries' names in them, too.
+    # optax's modules also contain names of other libraries.
     is_ours = inspect.isfunction(found) and found.__module__.startswith(_PREFIX)
     parameters = inspect.signature(found).parameters if is_ours else {}
     require(
@@ -119,7 +119,7 @@ def _of_optax(name: Any) -> type[Optimiser] | None:
 
 
 def _plain_type(default: Any, annotation: Any) -> Any:
-    """Return the type of a field for an argument of optax's; None where no field can hold it."""
+    """Return the type of a field for an optax argument; None if no field can hold it."""
     if isinstance(default, bool | int | float | str):
         return type(default)
     if isinstance(default, tuple) and all(isinstance(each, float) for each in default):
@@ -138,7 +138,7 @@ class _OptaxOptimiser(Optimiser):
     function: ClassVar[Callable[..., Any]]
 
     def __post_init__(self) -> None:
-        """Try a step's shapes, as a function may need more than a gradient, or refuse a setting."""
+        """Trace a step, because a function may need more than a gradient, or reject a setting."""
 
         def step(weights: Any) -> Any:
             optimiser = self.make(lambda count: 1e-3, 0.0)
@@ -153,7 +153,7 @@ class _OptaxOptimiser(Optimiser):
             ) from error
 
     def make(self, learning_rate: Rate, weight_decay: float) -> Any:
-        """Call the function; one without a weight decay gets it through its gradient."""
+        """Call the function; if it takes no weight decay, add that to the gradient."""
         settings = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
         settings["learning_rate"] = learning_rate
         parameters = inspect.signature(self.function).parameters
@@ -165,10 +165,10 @@ class _OptaxOptimiser(Optimiser):
 
 
 def _matrices(weights: Any) -> Any:
-    """Return where the two axes of each matrix are, and None for all else; see `_MATRICES`.
+    """Return the two axes of each matrix, and None for everything else; see `_MATRICES`.
 
-    The first axis of a stack of blocks is no axis of theirs: blocks' vectors are no matrices. Nor
-    are tokens and positions, as embeddings are none (Jordan et al. 2024).
+    The first axis of a stack numbers the blocks: stacked vectors are not matrices. Nor are tokens
+    and positions, because embeddings are not (Jordan et al. 2024).
     """
     from optax.contrib import MuonDimensionNumbers
 
@@ -200,7 +200,7 @@ class _Moments(Optimiser):
 
 @OPTIMISERS.register("adamw")
 class AdamW(_Moments):
-    """AdamW (Loshchilov and Hutter 2019), as torch has it: weights decay apart from the gradient.
+    """AdamW (Loshchilov and Hutter 2019), as in torch: weights decay separately from the gradient.
 
     Example:
         >>> from crisalad_jax import OptimiserConfig
@@ -209,7 +209,7 @@ class AdamW(_Moments):
     """
 
     def make(self, learning_rate: Rate, weight_decay: float) -> Any:
-        """Return optax's."""
+        """Return optax's AdamW."""
         import optax
 
         return optax.adamw(learning_rate, self.b1, self.b2, weight_decay=weight_decay)
@@ -217,10 +217,10 @@ class AdamW(_Moments):
 
 @OPTIMISERS.register("adam")
 class Adam(_Moments):
-    """Adam (Kingma and Ba 2015), as torch has it: the weight decay is part of the gradient."""
+    """Adam (Kingma and Ba 2015), as in torch: the weight decay is part of the gradient."""
 
     def make(self, learning_rate: Rate, weight_decay: float) -> Any:
-        """Return optax's, behind the weight decay."""
+        """Return optax's Adam, after the weight decay."""
         import optax
 
         return _decayed(weight_decay, optax.adam(learning_rate, self.b1, self.b2))
@@ -231,10 +231,10 @@ class Sgd(Optimiser):
     """SGD with torch's momentum, without dampening; the weight decay is part of the gradient."""
 
     momentum: Fraction = 0.9
-    """Share of the last step's direction that is kept."""
+    """Share of the previous direction to retain."""
 
     def make(self, learning_rate: Rate, weight_decay: float) -> Any:
-        """Return optax's, behind the weight decay."""
+        """Return optax's SGD, after the weight decay."""
         import optax
 
         return _decayed(weight_decay, optax.sgd(learning_rate, self.momentum))

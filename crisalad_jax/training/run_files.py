@@ -39,7 +39,7 @@ SAVE_SECONDS = 300
 """Longest time between saved states; validations and the end of a run save too."""
 
 DATA = "data.json"
-"""Name of what a run records of its data (`write_data`)."""
+"""File in which a run records its data (`write_data`)."""
 
 
 class RunState(NamedTuple):
@@ -47,20 +47,20 @@ class RunState(NamedTuple):
 
     training: TrainState
     mined: Mined | Drawn | None
-    """The batches of the round that it is in; None where they do not depend on the model."""
+    """The batches of the current round; None if they do not depend on the model."""
 
 
 @dataclasses.dataclass
 class RunRecord:
-    """The state of a run besides its arrays, as plain values saved with every checkpoint."""
+    """The state of a run other than its arrays, as plain values saved with every checkpoint."""
 
     checksums: dict[str, int]
     """Checksums of the weights before the first step, of the names of all training images and their
-    division into places, and of the validation benchmark (0 where there is none)."""
+    division into places, and of the validation benchmark (0 if there is none)."""
     sources: dict[str, list[Any]]
-    """Name and source's digest of every part of the configuration."""
+    """Name and source digest of every part of the configuration."""
     step: int = 0
-    """Number of steps that are taken and logged."""
+    """Number of steps taken and logged."""
     validated: int = 0
     """Step of the last validation."""
     best: list[list[Any]] = dataclasses.field(default_factory=list)
@@ -71,9 +71,9 @@ class RunRecord:
     skipped_images: int = 0
 
     def add_validation(self, recall: float, config: TrainConfig) -> None:
-        """Record a validation of this step, and decide on an early stop."""
+        """Record a validation of this step, and decide whether to stop early."""
         newest = [recall, self.step]
-        # Of equal recalls the first counts as the best.
+        # Among equal recalls, the first counts as the best.
         best = sorted([*self.best, newest], key=lambda each: (-each[0], each[1]))
         self.best = best[: config.save_top_k]
         self.without_gain = 0 if best[0] == newest else self.without_gain + 1
@@ -82,29 +82,29 @@ class RunRecord:
 
 
 class RunFiles:
-    """The files in a run's folder; the primary process alone writes them."""
+    """The files in a run's folder; only the primary process writes them."""
 
     def __init__(self, out: pathlib.Path, config: TrainConfig, record: RunRecord) -> None:
-        """Take the folder, which `load` acquires, and the record of a run before its first step."""
+        """Store the folder, which `load` locks, and the record of a run before its first step."""
         self.out, self.record, self._config = out, record, config
         self._opened = contextlib.ExitStack()
         self._saved: RunRecord | None = None
         self._saved_at = time.monotonic()
 
     def load(self, state: RunState) -> RunState:
-        """Acquire the folder until `close`, and load the run there, if there is one.
+        """Lock the folder until `close`, and load the run in it, if there is one.
 
         All processes call it together.
 
         Args:
-            state: that of a run before its first step.
+            state: the state of a run before its first step.
 
         Returns:
-            The state to resume from, which `record` is for.
+            The state to resume from, which `record` describes.
 
         Raises:
-            InputError: what `check_run` raises; another process writes there; or the run started
-                from something else.
+            InputError: what `check_run` raises; another process is writing there; or the run had a
+                different start.
         """
 
         def load() -> dict[str, Any]:
@@ -124,7 +124,7 @@ class RunFiles:
                 write_json(out / "config.json", to_plain(config))
             for folder in (out, out / "best"):
                 remove_temporaries(folder)
-            # A signal, or an error, before the first state leaves no empty folder.
+            # A signal or an error before the first state must not leave an empty folder.
             opened.enter_context(made_folder(out / "state"))
             self._states = StateStore(out / "state")
             opened.callback(self._states.close)
@@ -154,8 +154,8 @@ class RunFiles:
         """Write the weights of this step, if the record counts it among the best.
 
         Args:
-            params: the model's.
-            loss: of `TrainState.saved_loss`.
+            params: the model's parameters.
+            loss: the loss's parameters, from `TrainState.saved_loss`.
         """
         steps = [step for _, step in self.record.best]
         paths = [self.out / "best.safetensors"] if steps[0] == self.record.step else []
@@ -166,7 +166,7 @@ class RunFiles:
                 self._save_weights(path, params, loss)
 
     def _save_weights(self, path: pathlib.Path, params: Crisalad, loss: PyTree) -> None:
-        # Of pairs there is a single group.
+        # A loss of pairs has a single group.
         learnt = None if loss is None else jax.tree.map(lambda leaf: leaf[0], loss)
         saved = None if loss is None else (self._config.loss, learnt)
         save_weights(path, Model(params, self._config.model), loss=saved)
@@ -178,7 +178,7 @@ class RunFiles:
     def save(self, state: RunState, params: Callable[[], Crisalad]) -> None:
         """Write the weights and the state, unless they are saved already.
 
-        The state is written while training goes on. Only what is written asks for `params`.
+        The state is written while training continues. `params` is called only to write weights.
         """
         if distributed.is_primary() and self._saved != self.record:
             with wrap_os_errors(self.out):
@@ -198,10 +198,10 @@ class RunFiles:
         return self.out / "best" / f"step-{step:08}.safetensors"
 
     def _drop_old_best(self) -> None:
-        """Remove weights that the record does not count among the best, or not yet."""
+        """Remove weights that the record does not list among the best, or does not list yet."""
         best_paths = {self._best_path(step) for _, step in self.record.best}
         for path in set((self.out / "best").glob("step-*.safetensors")) - best_paths:
-            self._states.wait()  # a kill before would leave a state that still lists them
+            self._states.wait()  # or a kill could leave a state that still lists them
             path.unlink()
 
 
@@ -222,20 +222,20 @@ def _check_start(
 
 
 def extend_run(out: pathlib.Path, config: TrainConfig, record: RunRecord) -> None:
-    """Write the configuration of a run that resumes for more epochs, and how it came to them.
+    """Write the configuration of a run that resumes with more epochs, and the epochs it had before.
 
-    `epochs.json` lists the epochs that the run had before, each with the step that it had come to.
-    A warning says if the learning rate is not that of a run that had them from the start.
+    `epochs.json` lists the earlier numbers of epochs, each with the step that the run had reached.
+    Warn if the learning rate differs from that of a run with all epochs from the start.
 
     Args:
         out: the run's folder.
-        config: its configuration, with more epochs than the one there.
-        record: what it resumes from.
+        config: its configuration, with more epochs than the existing one.
+        record: the record that it resumes from.
     """
     path, history = out / "config.json", out / "epochs.json"
     before = read_config(TrainConfig, path).epochs
     known = read_json(history, "the epochs of a run")["before"] if history.exists() else []
-    # After a kill between the two files, the last entry is there already.
+    # After a kill between the two writes, the last entry already exists.
     known = [each for each in known if each["epochs"] != before]
     write_json(history, {"before": [*known, {"epochs": before, "step": record.step}]})
     write_json(path, to_plain(config))
@@ -281,7 +281,7 @@ def write_data(
 
     Args:
         out: the folder.
-        name: of the training data.
+        name: name of the training data.
         places: the training data.
         benchmark: the validation set, if there is one.
     """
@@ -309,10 +309,10 @@ def checksum_of_places(places: TrainingSet) -> int:
 
 
 def checksum_of_sizes(places: TrainingSet) -> int:
-    """Compute the CRC of the sizes of all images' files.
+    """Compute the CRC of the sizes of all image files.
 
     Raises:
-        InputError: an address that cannot be asked.
+        InputError: an address cannot be reached.
     """
     paths = (each.path(image) for each in sets_of(places) for image in range(len(each.files)))
     files = list(dict.fromkeys(map(file_of, paths)))
@@ -325,7 +325,7 @@ def checksum_of_config(config: TrainConfig) -> int:
 
 
 def checksum_of_benchmark(benchmark: Benchmark) -> int:
-    """Compute the CRC of a benchmark's name and of its images' names, in any folder."""
+    """Compute the CRC of the names of a benchmark and its images, whatever their folder."""
     names = (path.name for path in (*benchmark.database, *benchmark.queries))
     return checksum([_text((benchmark.name, *names))])
 
@@ -335,7 +335,7 @@ def _text(names: Iterable[Any]) -> np.ndarray:
 
 
 def checksum(arrays: Iterable[Any]) -> int:
-    """Compute the CRC of all arrays, which tells others from the same."""
+    """Compute the CRC of all arrays, to detect differences."""
     value = 0
     for each in arrays:
         value = zlib.crc32(np.asarray(each).tobytes(), value)

@@ -1,4 +1,4 @@
-"""Schedules of the learning rate: the interface of a new one, and the built-in ones.
+"""Learning-rate schedules: the interface of custom ones, and the built-in ones.
 
 The warm-up comes before them and is the same for all (`optimiser.learning_rate_schedule`).
 """
@@ -22,7 +22,7 @@ from crisalad_jax.config.short_repr import brief
 
 @brief
 class RunSteps(NamedTuple):
-    """Numbers of steps of the optimiser, by which a schedule is laid out."""
+    """Numbers of optimiser steps, from which a schedule is computed."""
 
     after_warmup: int
     """Steps of the run after the warm-up, at least 1."""
@@ -33,10 +33,10 @@ class RunSteps(NamedTuple):
 
 
 class Schedule(Part, abc.ABC):
-    """A learning rate that changes: a frozen dataclass whose fields are its settings.
+    """A learning-rate schedule: a frozen dataclass whose fields are its settings.
 
     A plain function of (step, steps) that returns a share of the learning rate is a schedule
-    without settings: of the step after the warm-up, from 0, and of the number of these steps.
+    without settings. `step` counts from 0 after the warm-up; `steps` is the number of these steps.
 
     Example:
         >>> from crisalad_jax import OptimiserConfig, register_schedule
@@ -55,8 +55,8 @@ class Schedule(Part, abc.ABC):
         """Return the learning rate of a step, a traced number.
 
         Args:
-            step: number of steps of the optimiser after the warm-up, from 0; a traced float.
-            learning_rate: the highest, at which the warm-up ends.
+            step: number of optimiser steps after the warm-up, from 0; a traced float.
+            learning_rate: the peak learning rate, at which the warm-up ends.
             run: numbers of steps.
         """
 
@@ -91,9 +91,9 @@ class _Decay(Schedule):
     """A decay to a share of the learning rate."""
 
     end_fraction: NonNegativeFloat = 0.0
-    """Share of the learning rate that is left at the end."""
+    """Share of the learning rate left at the end."""
     decay_steps: PositiveInt | None = None
-    """Length of the decay, after which the learning rate stays; None is the whole run."""
+    """Length of the decay, before a constant learning rate; None is the whole run."""
 
     @property
     def spans_run(self) -> bool:
@@ -103,11 +103,11 @@ class _Decay(Schedule):
 
 @SCHEDULES.register("linear")
 class LinearSchedule(_Decay):
-    """Linear decay, step by step (SALAD's code, `LinearLR` of torch)."""
+    """Linear decay, step by step (SALAD's code, torch's `LinearLR`)."""
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
-        """Return a number on the line."""
-        import optax  # by those who train alone: a configuration does without
+        """Return the learning rate on the line."""
+        import optax  # only to train: a configuration does not need it
 
         end, length = learning_rate * self.end_fraction, self.decay_steps or run.after_warmup
         return optax.linear_schedule(learning_rate, end, length)(step)
@@ -115,10 +115,10 @@ class LinearSchedule(_Decay):
 
 @SCHEDULES.register("cosine")
 class CosineSchedule(_Decay):
-    """Half a period of a cosine (Loshchilov and Hutter 2017, without restarts)."""
+    """Cosine decay over half a period (Loshchilov and Hutter 2017, without restarts)."""
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
-        """Return a number on the cosine."""
+        """Return the learning rate on the cosine."""
         import optax
 
         length = self.decay_steps or run.after_warmup
@@ -147,13 +147,13 @@ class StepSchedule(Schedule):
 class MilestonesSchedule(Schedule):
     """A step down after each of some epochs, counted from the start; the defaults are MixVPR's.
 
-    One that comes before the end of the warm-up is without effect, as in GSV-Cities' code, in which
-    the warm-up sets the learning rate anew.
+    A milestone before the end of the warm-up has no effect, as in GSV-Cities' code, where the
+    warm-up overwrites the learning rate.
     """
 
     spans_run: ClassVar[bool] = False
     epochs: tuple[int, ...] = (5, 10, 15, 25, 45)
-    """Numbers of epochs after which the learning rate steps down."""
+    """Epochs after which the learning rate steps down."""
     gamma: PositiveFloat = 0.3
     """What a step down multiplies the learning rate by."""
 

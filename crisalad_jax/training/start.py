@@ -1,4 +1,4 @@
-"""What a run reads before its first step: its images, and the parameters that it starts from."""
+"""Read what a run needs before its first step: its images and its initial parameters."""
 
 import os
 import pathlib
@@ -48,18 +48,18 @@ def read_inputs(
     quiet: bool = False,
     **grouping: Any,
 ) -> RunInputs:
-    """Read the training set, the validation set and the start of a run; see `experiments.train`.
+    """Read the training set, validation set and initial parameters; see `experiments.train`.
 
     All processes call it together. Without `weights`, an aggregator's centroids are fitted to the
     training images.
 
     Args:
-        config: the run's.
-        data: the training set, read or not, or those of `config.mixture` by name.
+        config: the run's configuration.
+        data: the training set, read or as a path, or the sets of `config.mixture` by name.
         out: folder of the run, which is checked first.
-        images: folder of the images that a file of queries names.
+        images: folder of the images that a file of queries lists.
         validation: evaluation set.
-        validation_images: folder of the images that a file at `validation` names.
+        validation_images: folder of the images that a file at `validation` lists.
         weights: see `read_start`.
         backbone: see `read_start`.
         on_bad_image: "stop", or "skip" to leave unreadable images out.
@@ -70,7 +70,7 @@ def read_inputs(
         (places, validation, initial).
 
     Raises:
-        InputError: in every process, where one cannot read its files or they do not fit.
+        InputError: in every process, if one cannot read its files or they do not fit.
     """
     quiet = quiet or not distributed.is_primary()
 
@@ -85,11 +85,11 @@ def read_inputs(
         how: Any = {"images": validation_images, "on_bad_image": on_bad_image}
         return places, open_benchmark(validation, **how), initial
 
-    # This refuses a wrong name before anything is read.
+    # A wrong name is rejected before anything is read.
     distributed.raise_together(lambda: count_trainable(config.model, config.trainable))
     distributed.run_on_primary(lambda: check_run(pathlib.Path(out), config))
     places, benchmark, initial = distributed.raise_together(read)
-    # Others would not meet in what follows.
+    # Otherwise the collective operations below would not match.
     given = {"configuration": checksum_of_config(config), "--weights": weights is not None}
     distributed.check_same(given)
     if weights is None and config.model.aggregator.trainable:
@@ -105,7 +105,7 @@ def _read_set(
     on_bad_image: OnBadImage,
     grouping: dict[str, Any],
 ) -> TrainingSet:
-    """Read the training set: places, of one set or several, or queries whose tuples are mined."""
+    """Read the training set: places of one set or several, or queries to mine tuples for."""
     named = data if isinstance(data, Mapping) else {}
     check_names("--data", named, config)
     unused, what = {"data_images": images}, "trains on places"
@@ -149,17 +149,17 @@ def read_start(
 ) -> Crisalad | None:
     """Read the parameters that a run starts from.
 
-    A note tells of weights that were made for images of another size, or resized in another way.
+    Warn about weights that were made for images of another size or resized in another way.
 
     Args:
-        config: the run's; `recipe` takes the model of weights.
-        weights: a whole model of this package, or a published model's name.
-        backbone: a checkpoint of which the backbone alone is taken, public or of this package, or a
-            published model's name.
-        quiet: no progress bar of a download.
+        config: the run's configuration; `recipe` can make it for the model of given weights.
+        weights: a complete model of this package, or the name of a published model.
+        backbone: a checkpoint from which only the backbone is taken, public or of this package, or
+            the name of a published model.
+        quiet: no download progress bar.
 
     Returns:
-        All parameters; None for random ones, with neither file.
+        All parameters; None, which stands for random ones, if neither is given.
 
     Raises:
         InputError: both are given, or a file cannot be read or does not fit the model.
@@ -187,17 +187,17 @@ def with_vocabulary_of(
 ) -> Crisalad | None:
     """Fit an aggregator's centroids to the training images, if it starts from centroids.
 
-    The same start always gets the same centroids, so that runs can resume. All processes call it
+    The same start always gives the same centroids, so that runs can resume. All processes call it
     together, and each gets the centroids of the primary process.
 
     Args:
-        initial: the parameters; None for random ones, by the run's seed.
-        config: the run's.
+        initial: the parameters; None for random ones from the run's seed.
+        config: the run's configuration.
         places: the training images.
         **how: `on_bad_image` and `quiet` of `with_vocabulary`.
 
     Returns:
-        The parameters; as they are where the aggregator has no centroids.
+        The parameters, unchanged if the aggregator has no centroids.
 
     Raises:
         InputError: what `with_vocabulary` raises.

@@ -38,8 +38,8 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
 WHOLE_LOSS = 1024
-"""Most images whose loss every device computes whole, at most a hundredth of a step's work
-(docs/training.md). Of more images XLA splits it, and exchanges its parts."""
+"""Most images for which every device computes the whole loss, at most a hundredth of a step's work
+(docs/training.md). For more images, XLA splits the loss and exchanges its parts."""
 LossFunction = Callable[..., Float[Array, ""]]
 """Takes descriptors, labels and, if it has a third argument, which images are valid."""
 
@@ -56,17 +56,17 @@ class TrainState(NamedTuple):
     """Parameters of the loss, if it has any."""
 
     def saved_loss(self, config: LossConfig) -> PyTree:
-        """Return the loss's parameters that weight files hold, if any.
+        """Return the loss's parameters that weight files store, if any.
 
-        Vectors of classes and projections to a teacher's length are large, and of no use after the
-        run: only `state/` has them.
+        Class vectors and projections to a teacher's length are large and useless after the run:
+        only `state/` stores them.
         """
         of_run = config.kind.grouping is not None or config.kind.reads_targets
         return None if of_run or self.classifiers is None else self.classifiers.weights
 
     @property
     def averaged(self) -> PyTree:
-        """`trainable` to validate and save, with the optimiser's average where it keeps one."""
+        """`trainable` for validation and saving: the optimiser's average, if it has one."""
         statistics, learnt = split_statistics(self.trainable)
         return eqx.combine(averaged_weights(self.optimiser, learnt), statistics)
 
@@ -83,7 +83,7 @@ class Metrics(NamedTuple):
     loss_numbers: Mapping[str, Array] | None
     """The loss's own numbers (`LossValue.numbers`)."""
     gradient_norm: Float[Array, ""]
-    """Norm of the whole gradient, that of a classifier included."""
+    """Norm of the whole gradient, including a classifier's."""
     learning_rate: Float[Array, ""] | None
     """Learning rate of this step; None for an optimiser that was passed in."""
     images: Int[Array, ""]
@@ -91,11 +91,11 @@ class Metrics(NamedTuple):
     transport: TransportStatistics | None
     """Means over the valid images, with dropout; None if the aggregator has no transport."""
     updated: Bool[Array, ""]
-    """Whether the step was taken, and not skipped."""
+    """Whether the step was taken, not skipped."""
 
 
 def named_scalars(values: Metrics | TransportStatistics) -> dict[str, float]:
-    """List scalars by name, the transport's by their own, a loss's as `loss.NAME`; no None."""
+    """List scalars by name, without None: the transport's unprefixed, a loss's as `loss.NAME`."""
     return {
         name.removeprefix("transport.").replace("loss_numbers.", "loss.", 1): float(leaf)
         for name, leaf in named_leaves(values).items()
@@ -110,40 +110,40 @@ class StepConfig:
     loss: LossConfig
     optimiser: OptimiserConfig | optax.GradientTransformation
     steps: int = 1
-    """Number of steps of the run, by which a linear schedule falls."""
+    """Number of steps of the run, for a schedule that spans it."""
     steps_per_epoch: int = 1
-    """Number of steps of an epoch, for a learning rate that falls every few epochs, and for
-    gradients that add up within one."""
+    """Number of steps of an epoch, for schedules by epochs and for gradient accumulation, which
+    ends with each epoch."""
     micro_batch: int | None = None
     """See `nn.model.extract_tokens`."""
     shard_over: Mesh | None = None
     """Devices to shard the state over, as `devices.shard_spec` says; None replicates it.
 
-    The gradient is taken of replicated parameters, the optimiser's step of shards (the first stage
-    of ZeRO, Rajbhandari et al. 2020)."""
+    The gradient is taken on replicated parameters, the optimiser step on shards (the first stage of
+    ZeRO, Rajbhandari et al. 2020)."""
     classes: tuple[int, ...] = ()
-    """Number of classes of each group, where the loss classifies; an epoch trains one group."""
+    """Number of classes of each group, if the loss classifies; an epoch trains one group."""
     batch_norm: Literal["batch", "stored"] = "batch"
     """See `TrainConfig.batch_norm`."""
     tuples: bool = False
     """Whether labels are those of mined tuples (`tuple_labels`), not of places."""
     mixture: tuple[MixtureSet, ...] = ()
-    """Sets whose sub-batches have their own losses, in the place of `loss`."""
+    """Sets whose sub-batches have their own losses, instead of `loss`."""
 
     def sub_batches(self, images: int) -> tuple[int, ...]:
-        """Return how many of a step's images are each set's, in their order."""
+        """Return the number of images of each set in a step, in the order of the sets."""
         shares = [each.share for each in self.mixture]
         return tuple(images * share // sum(shares) for share in shares)
 
     def learning_rate(self, step: Int[Array, ""]) -> Float[Array, ""] | None:
-        """Compute the learning rate of a step, from 0; None if the optimiser is passed in."""
+        """Compute the learning rate of a step (from 0); None if the optimiser was passed in."""
         if not isinstance(self.optimiser, OptimiserConfig):
             return None
         schedule = learning_rate_schedule(self.optimiser, self.steps, self.steps_per_epoch)
         return jnp.asarray(schedule(count_steps(self.optimiser, step, self.steps_per_epoch)))
 
     def make_optimiser(self) -> optax.GradientTransformation:
-        """Make the optimiser of a run of so many steps."""
+        """Make the optimiser of a run of `steps` steps."""
         if not isinstance(self.optimiser, OptimiserConfig):
             return self.optimiser
         return make_optimiser(self.optimiser, self.steps, self.steps_per_epoch)
@@ -165,19 +165,19 @@ def init_train_state(
 ) -> tuple[TrainState, PyTree]:
     """Make the state before the first step, and the frozen parameters, which no step changes.
 
-    A warning says if the warm-up takes more than a quarter of the run.
+    Warn if the warm-up takes more than a quarter of the run.
 
     Args:
         params: the model to start from.
         trainable: see `split_params`.
-        config: the step's, of `step_config`.
-        key: draws the parameters of a loss that has some.
+        config: the step's configuration, from `step_config`.
+        key: draws the parameters of the loss, if it has any.
 
     Returns:
-        (state, frozen). The state is a copy, so `params` stay of use.
+        (state, frozen). The state is a copy, so `params` can still be used.
 
     Raises:
-        InputError: what `split_params` raises; nothing of the model trains, as of AnyLoc's, whose
+        InputError: what `split_params` raises; nothing in the model trains, as in AnyLoc's, whose
             vocabulary fits one backbone; or the loss needs a key, or classes.
 
     Example:
@@ -203,7 +203,7 @@ def init_train_state(
         statistics = None
         if config.batch_norm == "batch":
             statistics, frozen = split_statistics(frozen)
-        # Copied, because a step uses up the buffers of its state, and `params` are the caller's.
+        # Copied, because a step donates the buffers of its state, and `params` are the caller's.
         chosen, statistics = jax.tree.map(jnp.copy, (chosen, statistics))
         optimiser = config.make_optimiser().init(chosen)
         dim = config.model.descriptor_dim
@@ -233,10 +233,10 @@ def step_config(
     """Make the part of a run's configuration that its compiled step depends on.
 
     Args:
-        config: the run's.
+        config: the run's configuration.
         steps: number of steps of the run.
         steps_per_epoch: number of steps of an epoch.
-        optimiser: any optimiser of optax, in place of the configuration's.
+        optimiser: any optax optimiser, in place of the configuration's.
         loss: any function of (descriptors, labels) or (descriptors, labels, valid), or of a
             `LossBatch`, that returns a number, in place of the configuration's.
         classes: number of classes of each group, for a loss that classifies.
@@ -277,12 +277,12 @@ def make_train_step(config: StepConfig) -> Callable[..., tuple[TrainState, Metri
     """Make a compiled step of training.
 
     Args:
-        config: of `step_config`, as `init_train_state` takes it.
+        config: from `step_config`, as `init_train_state` takes it.
 
     Returns:
         `step(state, frozen, images, labels, key, valid=None, targets=None) -> (state, metrics)`;
-        see `train_step`. The state that goes in is used up. It raises InputError for labels of 2^31
-        or more, a state of another configuration, or images that are no array of pixels.
+        see `train_step`. The input state is donated. The step raises InputError for labels of 2^31
+        or more, a state of another configuration, or images that are not an array of pixels.
 
     Example:
         >>> import jax, numpy as np, optax
@@ -320,10 +320,10 @@ def checked_batch(
     labels: Int[Array | np.ndarray, " image"],
     config: ModelConfig,
 ) -> tuple[Array, Int[Array, " image"]]:
-    """Check a batch, and return it as arrays of JAX; raises as the step of `make_train_step`."""
+    """Check a batch and return it as JAX arrays; raises like the step of `make_train_step`."""
     check_pixels(images, config.preprocessing)
-    # JAX would keep the lower half of each, and join places that differ in the upper one.
-    # Its own arrays have no such labels, and may be traced or still be computed.
+    # JAX would truncate 64-bit labels, and merge places that differ in the upper half only. JAX
+    # arrays have no such labels, and may be traced or not computed yet.
     if not isinstance(labels, jax.Array) and np.max(labels, initial=0) >= 2**31:
         raise InputError(f"labels: found up to {np.max(labels)}, expected numbers below 2^31")
     return jnp.asarray(images), jnp.asarray(labels, jnp.int32)
@@ -342,20 +342,20 @@ def train_step(
     proceed: Bool[Array, ""] | bool = True,
     targets: Float[Array, "image target"] | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """Take one step of the optimiser on the loss of a batch, or add its gradient up for one.
+    """Take one optimiser step on the loss of a batch, or accumulate its gradient for one.
 
-    The gradient is taken of the trainable parameters, and of the loss's own for the epoch's group.
+    The gradient is that of the trainable parameters, and of the loss's own for the epoch's group.
     If the loss classifies, labels are that group's classes. Dropout is drawn from `key` and the
-    step's number, so that a resumed run repeats an uninterrupted one.
+    step number, so that a resumed run repeats an uninterrupted one.
 
-    Running statistics in the state are updated, as torch's batch norms in training mode do it, and
-    the batch is normalised by its own. Without any in the state, the stored ones stay in use.
+    Running statistics in the state are updated as by torch's batch norms in training mode, and the
+    batch is normalised by its own. If the state has none, the stored ones are used.
 
-    If the loss or the gradient is not finite, or no image is valid, the state is returned as it was
+    If the loss or the gradient is not finite, or no image is valid, the state is returned unchanged
     and `Metrics.updated` is False. Passed to the next step as `proceed`, it skips that step too. So
-    a loop may read metrics one step late, and still have the state before the failed step.
+    a loop can read metrics one step late and still have the state before the failed step.
 
-    A loss that learns from a teacher takes its descriptors of the images as `targets`.
+    A loss that learns from a teacher takes the teacher's descriptors of the images as `targets`.
     """
     dropout_key = jax.random.fold_in(key, state.step)
     (result, transport, statistics, all_valid), (gradient, classifier_gradient) = loss_and_gradient(
@@ -391,12 +391,12 @@ def train_step(
 
 
 def _group(state: TrainState, config: StepConfig) -> Int[Array, ""]:
-    """Return which group of classes trains, by the epoch."""
+    """Return which group of classes trains in the current epoch."""
     return state.step // config.steps_per_epoch % max(len(config.classes), 1)
 
 
 class BatchLoss(NamedTuple):
-    """What a forward pass of a batch gives."""
+    """The results of a forward pass on a batch."""
 
     result: LossResult
     transport: TransportStatistics | None
@@ -417,7 +417,7 @@ def loss_and_gradient(
     config: StepConfig,
     targets: Float[Array, "image target"] | None = None,
 ) -> tuple[BatchLoss, tuple[PyTree, PyTree]]:
-    """Compute the loss of a batch, and its gradient, in a trace; see `train_step`.
+    """Compute the loss of a batch and its gradient inside a trace; see `train_step`.
 
     Args:
         state: the state; its optimiser is not read.
@@ -425,19 +425,20 @@ def loss_and_gradient(
         images: see `train_step`.
         labels: see `train_step`.
         valid: see `train_step`.
-        key: draws the dropout; None is without.
-        config: the step's.
+        key: draws the dropout; None disables it.
+        config: the step's configuration.
         targets: a teacher's descriptors, for a loss that reads them.
 
     Returns:
-        What the forward pass gave, and the gradients of the trainable parameters and of the loss's.
+        The results of the forward pass, and the gradients of what trains and of the loss's
+        parameters.
     """
     classifier, group = None, _group(state, config)
     if state.classifiers is not None:
         classifier = jax.tree.map(lambda leaf: leaf[group], state.classifiers.weights)
 
     statistics, learnt = split_statistics(state.trainable)
-    # A few numbers that the loss, the mask and the metrics read for all images.
+    # Small arrays that the loss, the mask and the metrics need for all images.
     all_labels, all_valid = _gathered(labels, valid)
 
     def loss_of(trained: tuple[PyTree, Any]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
@@ -479,7 +480,7 @@ def loss_and_gradient(
 def _gathered(
     labels: Int[Array, " image"], valid: Bool[Array, " image"]
 ) -> tuple[Int[Array, " image"], Bool[Array, " image"]]:
-    """Gather the labels of all devices and what is valid, as one array."""
+    """Gather the labels and the valid masks of all devices, exchanged as one array."""
     mesh = devices.image_mesh()
     if mesh is None:
         return labels, valid
@@ -498,7 +499,7 @@ def _loss(
     targets: Float[Array, "image target"] | None,
     config: StepConfig,
 ) -> LossResult:
-    """Compute the loss of a batch, of places or of mined tuples, or of its sub-batches."""
+    """Compute the loss of a batch of places or mined tuples, or of its sub-batches."""
     if config.mixture:
         return _mixed_loss(descriptors, labels, valid, config)
     return metric_loss(
@@ -520,7 +521,7 @@ def _mixed_loss(
     valid: Bool[Array, " image"],
     config: StepConfig,
 ) -> LossResult:
-    """Add the weighted losses of the sub-batches, each of its own images alone."""
+    """Add the weighted losses of the sub-batches, each computed on its own images only."""
     ends = np.cumsum(config.sub_batches(len(labels)))[:-1]
     parts = zip(*(jnp.split(each, ends) for each in (descriptors, labels, valid)), strict=True)
     numbers: dict[str, Array] = {}

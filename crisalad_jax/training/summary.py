@@ -1,4 +1,4 @@
-"""The parts of a model: parameters, what trains, multiply-accumulates an image."""
+"""The parts of a model: parameters, what trains, multiply-accumulates per image."""
 
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ class AdapterSummary(NamedTuple):
 
     parameters: int
     macs: int
-    """Multiply-accumulates an image, with linears at every token."""
+    """Multiply-accumulates per image, with linears at all tokens."""
     paper_macs: int
     """Multiply-accumulates as the paper counts: each linear once, convolutions at every patch."""
 
@@ -28,7 +28,7 @@ class ModelSummary(NamedTuple):
     image_size: tuple[int, int]
     """Height and width in pixels."""
     images: str
-    """How images are resized, in words."""
+    """How images are resized, as text."""
     preprocessing: dict[str, Any]
     """How images are resized and normalised, as JSON values."""
     descriptor: int
@@ -40,23 +40,23 @@ class ModelSummary(NamedTuple):
     parts: list[PartCost]
     """A row for each part."""
     one_adapter: AdapterSummary | None
-    """Counts of one adapter; None where there are no adapters."""
+    """Counts of one adapter; None if there are no adapters."""
 
 
 @takes(config=ModelConfig)
 def model_summary(
     config: ModelConfig, trainable: str | None = None, *, images: int = 16
 ) -> ModelSummary:
-    """Count a model's parameters and multiply-accumulates, without computing anything.
+    """Count a model's parameters and multiply-accumulates, without running it.
 
     Args:
         config: the model.
         trainable: what trains, as `split_params` takes it. None is the adapters and the head, or
-            the head alone where there are no adapters.
-        images: number of images that look at each other in the cross-image encoder.
+            only the head if there are no adapters.
+        images: number of images that attend to each other in the cross-image encoder.
 
     Returns:
-        The numbers.
+        The counts.
 
     Raises:
         InputError: what `split_params` raises; or `images` below 1.
@@ -90,7 +90,7 @@ def model_summary(
 
 
 def model_words(config: ModelConfig) -> str:
-    """Describe a model's parts and its descriptor in a line.
+    """Describe a model's parts and its descriptor in one line.
 
     Args:
         config: the model.
@@ -113,7 +113,7 @@ def model_words(config: ModelConfig) -> str:
 
 
 def summary_json(summary: ModelSummary, name: str) -> dict[str, Any]:
-    """Put a summary into JSON values; `name` is the model's."""
+    """Convert a summary to JSON values; `name` is the model's."""
     values: dict[str, Any] = {"model": name} | summary._asdict()
     values["image_size"] = list(summary.image_size)
     values["parts"] = [cost._asdict() for cost in summary.parts]

@@ -1,4 +1,4 @@
-"""Which parameters train, and the split of a model into these and the frozen ones."""
+"""Choose which parameters train, and split a model into these and the frozen ones."""
 
 import dataclasses
 import difflib
@@ -27,7 +27,7 @@ _LAST_BLOCKS = re.compile(r"last-(\d+)-blocks")
 
 
 def terms_of(trainable: str) -> list[str]:
-    """Split what trains into its words and patterns.
+    """Split a `trainable` value into its words and patterns.
 
     Example:
         >>> terms_of("adapters, head")
@@ -37,7 +37,7 @@ def terms_of(trainable: str) -> list[str]:
 
 
 def shards_batch(trainable: str) -> bool:
-    """Return whether a batch is sharded over devices: not on a CPU where all parameters train.
+    """Return whether a batch is sharded over devices: not on a CPU if all parameters train.
 
     Each device holds its own copy of what trains, of the gradient and of the moments. If all
     parameters train, these copies take most of the memory, which a CPU's devices share; `tiny`
@@ -49,34 +49,34 @@ def shards_batch(trainable: str) -> bool:
 def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple[PyTree, PyTree]:
     """Split parameters into those that train and those that are frozen.
 
-    What trains is a comma list of words and patterns:
+    `trainable` is a comma list of words and patterns:
 
     - `all`; `head` (aggregator, cross-image encoder and projection); `adapters` (what the backbone
-      says is there to be trained, `Backbone.trains`); `last-N-blocks`; `norm` (the last layer norm,
-      if the aggregator asks for it); `positions` (class token and position embeddings).
-    - A pattern of dotted names, as file names are matched: `*` is any text, `[01]` one of two
-      characters. It names parameters, or all that is below them. Blocks are numbered from 0:
-      `backbone.blocks.1[01]`, or in all of them `backbone.blocks.attn`.
-    - With `-` before it, a word or pattern stays frozen.
+      marks as trainable, `Backbone.trains`); `last-N-blocks`; `norm` (the last layer norm, if the
+      aggregator asks for it); `positions` (class token and position embeddings).
+    - A pattern of dotted names, matched like file names: `*` is any text, `[01]` one of two
+      characters. It matches parameters, or all that is below a name. Blocks are numbered from 0, as
+      in `backbone.blocks.1[01]`; without a number, `backbone.blocks.attn` matches in all blocks.
+    - A leading `-` freezes a word or pattern.
 
     The paper trains "adapters,head", SALAD "last-4-blocks,norm,head".
 
     If blocks differ in what trains, the backbone's stack is cut, and `merge_params` joins it. So no
-    gradient is computed in frozen blocks before the first that trains, nor in the whole of this one
-    if only a part of it trains. Batch-norm statistics have no gradient and count as frozen, though
-    a step may update them. So does an aggregator that learns nothing (AnyLoc's vocabulary).
+    gradient is computed in frozen blocks before the first that trains, nor through all of that
+    block if only a part of it trains. Batch-norm statistics have no gradient and count as frozen,
+    though a step may update them. So does an aggregator that learns nothing (AnyLoc's vocabulary).
 
     Args:
         params: the whole model.
-        config: the model's.
+        config: the model's configuration.
         trainable: what trains.
 
     Returns:
-        (trainable, frozen): two trees of the model's structure, None for the other's leaves.
+        (trainable, frozen): two trees of the model's structure, with None for the other's leaves.
 
     Raises:
         InputError: parameters of another model; a word or pattern that matches nothing; or adapters
-            or a part of the head are left out without a `-`, and would stay as they were drawn.
+            or a part of the head are left out without a `-`, and would stay as initialised.
 
     Example:
         >>> import jax
@@ -88,7 +88,7 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
     """
     check_params(params, config)
     chosen = choose(params, config, trainable)
-    # For each block, whether it trains each of the parameters of a block that can.
+    # For each block, whether each of its parameters that can train does.
     in_blocks = [f for n, f in chosen.items() if len(f) > 1 and not _is_fixed(n, config)]
     rows = list(zip(*in_blocks, strict=True))
     cuts = {number for number in range(1, len(rows)) if rows[number] != rows[number - 1]}
@@ -112,7 +112,7 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
 
 
 def numbered_names(params: Crisalad, config: ModelConfig) -> dict[str, list[str]]:
-    """Return the name of each parameter, of a stack of blocks with the number of each block."""
+    """Return the names of each parameter; for a stack of blocks, one for each block's number."""
     depth, names = config.backbone.depth, {}
     for leaf, value in named_leaves(params).items():
         rest = leaf.removeprefix(_BLOCKS)
@@ -123,7 +123,7 @@ def numbered_names(params: Crisalad, config: ModelConfig) -> dict[str, list[str]
 
 
 def choose(params: Crisalad, config: ModelConfig, trainable: str) -> dict[str, tuple[bool, ...]]:
-    """Return whether each parameter trains, of a stack of blocks for each block."""
+    """Return whether each parameter trains; for a stack of blocks, block by block."""
     backbone, names = config.backbone, numbered_names(params, config)
 
     def matched(*patterns: str) -> set[tuple[str, int]]:
@@ -138,8 +138,8 @@ def choose(params: Crisalad, config: ModelConfig, trainable: str) -> dict[str, t
     for term in terms_of(trainable):
         word = term.removeprefix("-")
         own = matched(*_patterns_of(word, config))
-        # Models may have no head. A norm that the aggregator leaves out has no gradient: weight
-        # decay alone would move it.
+        # Models may have no head. A norm that the aggregator leaves out has no gradient: only
+        # weight decay would change it.
         may_lack = word in (ALL, HEAD, "norm") or term == f"-{ADAPTERS}"
         require(bool(own) or may_lack, f"trainable: {_unmatched(word, config, names)}")
         found[word == term] |= own
@@ -187,7 +187,7 @@ def _patterns_of(word: str, config: ModelConfig) -> Sequence[str]:
 
 
 def _unmatched(word: str, config: ModelConfig, names: Mapping[str, Iterable[str]]) -> str:
-    """Say that a word or pattern matches nothing, and which names are near."""
+    """Say that a word or pattern matches nothing, and which names are similar."""
     known: dict[str, None] = dict.fromkeys(_WORDS)
     for name in itertools.chain(names, *names.values()):
         known |= dict.fromkeys(itertools.accumulate(name.split("."), "{}.{}".format))
@@ -201,12 +201,12 @@ def _unmatched(word: str, config: ModelConfig, names: Mapping[str, Iterable[str]
 
 
 def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Crisalad:
-    """Join the two trees of `split_params` to the whole model.
+    """Join the two trees of `split_params` into the whole model.
 
     Args:
         trainable: what trains.
         frozen: what does not.
-        config: the model's.
+        config: the model's configuration.
 
     Returns:
         The whole model, with one stack of blocks.
@@ -229,7 +229,7 @@ def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Cris
 
 
 def count_trainable(config: ModelConfig, trainable: str) -> int:
-    """Count the parameters that train; raises as `split_params`."""
+    """Count the parameters that train; raises like `split_params`."""
     chosen = jax.eval_shape(
         lambda params: split_params(params, config, trainable)[0], parameter_shapes(config)
     )

@@ -39,7 +39,7 @@ class LossNotFiniteError(InputError):
 
 
 class Trainer:
-    """What trains, on the devices; a step is started before the one before is finished."""
+    """The training state on the devices; a step is started before the previous one is finished."""
 
     def __init__(
         self,
@@ -79,27 +79,27 @@ class Trainer:
         self._proceed: Any = self._devices.replicate(np.asarray(True))
         self._running: collections.deque[tuple[Metrics, int, float]] = collections.deque()
         """Metrics of the steps that the devices may still be computing, number of their images, and
-        seconds of waiting for these."""
+        seconds spent waiting for these."""
         self._finished_at = 0.0
         distributed.raise_together(self._check_memory)
 
     def resume(self, state: TrainState) -> None:
-        """Go on from a state, which has to be the same in all processes."""
+        """Resume from a state, which has to be the same in all processes."""
         # Copied, because a step donates the buffers of its state.
         self.state = jax.jit(lambda state: jax.tree.map(jnp.copy, state))(self._place(state))
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
-        """Return batches on the devices, each copied while they compute the one before."""
+        """Return batches on the devices, each copied while they compute the previous one."""
         return one_ahead(self._batch(batch) for batch in batches)
 
     def start_step(self, batch: Batch | None, waited: float) -> None:
-        """Start a step, while the devices may still compute the one before.
+        """Start a step, while the devices may still be computing the previous one.
 
-        After a step that is not taken no later one is (`train_step`).
+        After a step that is not taken, no later one is taken either (`train_step`).
 
         Args:
-            batch: the images; None for none, in a process that has failed to read them.
-            waited: seconds of waiting for them.
+            batch: the images; None if this process has failed to read them.
+            waited: seconds spent waiting for them.
         """
         if not self._running:
             self._finished_at = time.monotonic() - waited
@@ -111,14 +111,14 @@ class Trainer:
         self._running.append((metrics, len(images), waited))
 
     def finish_steps(self, *, leave: int = 0) -> Iterator[dict[str, float]]:
-        """Wait for the steps that were started but for the last ones.
+        """Wait for the started steps except the last `leave`.
 
         Yields:
-            What is logged of each.
+            The numbers to log for each step.
 
         Raises:
             InputError: no image of a step could be read.
-            LossNotFiniteError: a step was not taken for its loss; `state` is that before it.
+            LossNotFiniteError: a step was not taken because of its loss; `state` is the one before.
         """
         while len(self._running) > leave:
             metrics, size, waited = self._running.popleft()
@@ -151,7 +151,7 @@ class Trainer:
         return self._devices.gather(tree)
 
     def params(self, trainable: PyTree = None) -> Crisalad:
-        """Join the whole model in float32, with what trains as it was gathered; None gathers it."""
+        """Join the whole model in float32 from gathered trainable parameters; None gathers them."""
         if trainable is None:
             trainable = self.gather(self.state.averaged)
         return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)
@@ -160,21 +160,21 @@ class Trainer:
         place, valid, targets = self._devices.shard_batch, batch.valid, None
         if self._targets is not None:
             rows = self._targets[batch.indices]
-            # Zeros are of an image that the teacher could not read.
+            # Zeros mark an image that the teacher could not read.
             valid, targets = valid & rows.any(axis=1), place(rows)
         return place(batch.images), place(batch.labels), place(valid), targets
 
     def _no_images(self) -> Batch:
-        """Return a batch of images that are not valid."""
+        """Return a batch without valid images."""
         own = self._config.places_per_batch * self._config.images_per_place // jax.process_count()
         images = np.zeros((own, *self._config.model.input_size, 3), np.uint8)
         none = np.full(own, -1, np.int32)
         return self._batch(ImageBatch(images, none, np.zeros(own, bool), none.astype(np.int64)))
 
     def _check_memory(self) -> None:
-        """Check that a step fits the devices, by the compiler's analysis of its program.
+        """Check that a step fits the devices' memory, by the compiler's analysis of its program.
 
-        The first step finds the program that is compiled here. A TPU's compiler knows the limit
+        The first step reuses the program that is compiled here. A TPU's compiler checks the limit
         itself.
         """
         limit = memory_limit(self._devices.mesh.local_devices)
@@ -198,7 +198,7 @@ class Trainer:
 
 
 def run_keys(seed: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
-    """Make the keys that draw a run's first parameters, its dropout, and its classifiers."""
+    """Make the keys that draw a run's initial parameters, its dropout, and its classifiers."""
     key = jax.random.key(seed)
     params, dropout = jax.random.split(key)
     # Folds in 2, because folding in 0 or 1 may repeat the keys of the split.
@@ -221,16 +221,16 @@ def _choose_devices(config: TrainConfig) -> Devices:
 
 
 def memory_limit(devices: Sequence[Any]) -> int | None:
-    """Return the bytes that a program may take of each device; None where a platform tells none."""
+    """Return the bytes that a program may use on each device; None if the platform reports none."""
     limits = [(device.memory_stats() or {}).get("bytes_limit", 0) for device in devices]
     return min(limits, default=0) or None
 
 
 def memory_of(program: jax.stages.Compiled) -> int:
-    """Return the bytes that a compiled program takes of each device: all that it reads and writes.
+    """Return the bytes that a compiled program uses on each device: all that it reads and writes.
 
     Args:
-        program: with a state that it may overwrite (`donate_argnames`).
+        program: compiled with a state that it may overwrite (`donate_argnames`).
     """
     sizes = program.memory_analysis()
     assert sizes is not None

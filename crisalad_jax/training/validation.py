@@ -1,4 +1,4 @@
-"""The model of a run as it is: its recalls, its transport on a few queries, its descriptors."""
+"""Evaluate the current model of a run: recalls, transport on a few queries, descriptors."""
 
 import dataclasses
 import pathlib
@@ -24,7 +24,7 @@ WATCHED_QUERIES = 16
 MONITORED = {"R@1": (1,), "R@5": (5,), "R@1+R@5": (1, 5)}
 """Ranks whose recalls are added, by `TrainConfig.monitor`."""
 DESCRIBED_AT_ONCE = 16
-"""Number of images of a batch while tuples are mined."""
+"""Number of images in a batch while tuples are mined."""
 
 
 class Validation(NamedTuple):
@@ -35,7 +35,7 @@ class Validation(NamedTuple):
     metrics: dict[str, float]
     """Recalls, and the means of the transport's statistics."""
     words: str
-    """The recalls in words."""
+    """The recalls as text."""
 
 
 class Validator:
@@ -45,7 +45,7 @@ class Validator:
         """Check the benchmark's ground truth; without a benchmark no validation is due.
 
         Raises:
-            InputError: there is none.
+            InputError: it has none.
         """
         if benchmark is not None:
             benchmark.ground_truth()
@@ -59,7 +59,7 @@ class Validator:
         """Return whether the epoch that ends with this step needs a validation.
 
         Args:
-            step: number of steps that are taken.
+            step: number of steps taken so far.
             steps_per_epoch: number of steps of an epoch.
             last: the step of the last validation.
         """
@@ -68,7 +68,7 @@ class Validator:
         return self._benchmark is not None and rest == 0 and step > last and asked
 
     def validate(self, params: Crisalad) -> Validation:
-        """Evaluate the model, each image by itself, and watch its transport."""
+        """Evaluate the model on single images, and compute its transport statistics."""
         assert self._benchmark is not None
         (result,) = evaluate(
             Model(params, self._model),
@@ -91,7 +91,7 @@ class Validator:
         return Validation(monitored, recalls | watched, words)
 
     def describe(self, params: Crisalad, paths: Sequence[pathlib.Path]) -> np.ndarray:
-        """Describe image files, each by itself; NaN for those that cannot be read."""
+        """Describe image files independently; NaN for those that cannot be read."""
         model = self._config.model
         rows = np.full((len(paths), model.descriptor_dim), np.nan, np.float32)
         reading = dataclasses.replace(self._reading, batch_size=DESCRIBED_AT_ONCE)
@@ -104,7 +104,7 @@ class Validator:
         paths = benchmark.queries[:WATCHED_QUERIES]
         reading = Reading(batch_size=len(paths), cache=self._reading.cache)
         batches = reading.batches(paths, Preparation.of(self._model))
-        batch = next(iter(batches))  # of the size of the first, where sizes differ
+        batch = next(iter(batches))  # of the size of the first image, if sizes differ
         transport = extract_tokens(params, batch.images[batch.valid], self._model).transport
         means = jax.device_get(jax.tree.map(jnp.mean, transport))
         return {} if means is None else named_scalars(means)

@@ -1,8 +1,8 @@
-"""Vocabularies, and the starts of heads such as NetVLAD: k-means centroids of images' features.
+"""Vocabularies, and initial values of heads such as NetVLAD: k-means centroids of features.
 
-It is k-means of unit features: Euclidean, as in VLAD (Jegou et al. 2010) and at NetVLAD's start,
-or by the angle, as in AnyLoc's public code. A centroid is the mean of the features nearest to it,
-and no unit vector.
+The k-means of unit features is Euclidean, as in VLAD (Jegou et al. 2010) and NetVLAD's
+initialisation, or by angle, as in AnyLoc's public code. A centroid is the mean of the features
+nearest to it, not a unit vector.
 """
 
 import dataclasses
@@ -36,12 +36,12 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 
 IMAGES = 500
-"""Largest number of images that are read: with 100 patches of each, public NetVLAD's 50,000
-features."""
+"""Largest number of images to read: with 100 patches of each, the 50,000 features of NetVLAD's
+public code."""
 PATCHES = 100
-"""Largest number of patches that are taken of an image."""
+"""Largest number of patches to take from an image."""
 _ROUNDS = 100
-"""Number of rounds of k-means, which converges earlier."""
+"""Largest number of rounds of k-means, which converges earlier."""
 
 
 def with_vocabulary(
@@ -54,18 +54,17 @@ def with_vocabulary(
     on_bad_image: OnBadImage = "stop",
     quiet: bool = True,
 ) -> Crisalad:
-    """Fit a model's centroids to the features that its own backbone finds in images.
+    """Fit a model's centroids to the features that its own backbone extracts from images.
 
-    The same arguments give the same bits on the same machine. NetVLAD's scores start from the
-    centroids too (`netvlad.from_centroids`). AnyLoc's vocabulary is bound to its backbone: loading
-    it with another one raises an error.
+    The same arguments give bit-identical results on the same machine. NetVLAD's scores start from
+    the centroids too (`netvlad.from_centroids`). AnyLoc's vocabulary is bound to its backbone:
+    loading it with another one raises an error.
 
     Args:
-        model: its backbone is as it will be used, or as training starts from it; its aggregator
-            starts from centroids.
-        paths: images; not those that are evaluated on.
-        images: at most so many of them, drawn at random; None for all, whose features are in memory
-            together.
+        model: a model with its final backbone, or the one that training starts from, and an
+            aggregator that starts from centroids.
+        paths: images; not those used for evaluation.
+        images: largest number of them, drawn at random; None for all, with all features in memory.
         seed: draws the images, `PATCHES` patches of each, and the first centroids.
         batch_size: images described at a time.
         on_bad_image: "stop", or "skip" to leave unreadable images out.
@@ -77,7 +76,7 @@ def with_vocabulary(
     Raises:
         InputError: a model without a vocabulary; an argument out of range; an image that cannot be
             read, or none that can; fewer features than clusters or than VLAD-BuFF's components,
-            or features that are not finite or all alike.
+            or features that are not finite or all equal.
     """
     params, config = model
     aggregator = config.aggregator
@@ -119,11 +118,11 @@ class Vocabulary(NamedTuple):
     """A model whose vocabulary was built."""
 
     params: Crisalad
-    """The model's parameters, the vocabulary among them."""
+    """The model's parameters, with the vocabulary."""
     words: int
     """Number of centroids."""
     images: int
-    """Number of images that were asked for features."""
+    """Number of images selected for features."""
 
 
 def start_vocabulary(
@@ -141,11 +140,11 @@ def start_vocabulary(
     Args:
         aggregator: a registered aggregator that starts from centroids, or a recipe with one.
         preset: the size of the model.
-        backbone: a checkpoint of which the backbone is taken; None is a random one.
-        fields: settings of the aggregator that are other than the preset's, by name.
+        backbone: a checkpoint from which the backbone is taken; None is a random one.
+        fields: settings of the aggregator that differ from the preset's, by name.
         image_size: height and width in pixels; None is the preset's.
-        resize: words that change how images are resized; see `ModelConfig.resized`.
-        seed: draws what is random.
+        resize: values that change how images are resized; see `ModelConfig.resized`.
+        seed: random seed.
 
     Returns:
         The model.
@@ -154,7 +153,7 @@ def start_vocabulary(
         InputError: no such preset or aggregator, or one without a vocabulary; a field that it does
             not have; or a checkpoint that cannot be read or is of another size.
     """
-    # A recipe that mines is over another backbone than the preset's: of NetVLAD the head is meant.
+    # A recipe that mines has another backbone than the preset's: for NetVLAD the head is meant.
     is_head = aggregator in AGGREGATORS and mines_tuples(aggregator)
     own = aggregator in RECIPES and not is_head
     config = recipe(preset, aggregator if own else f"crisalad+{aggregator}").model
@@ -191,20 +190,20 @@ def build_vocabulary(
     """Build the vocabulary of a model from a folder of images, and write the model.
 
     Args:
-        model: its backbone is as it will be used; its aggregator starts from centroids.
+        model: a model with its final backbone and an aggregator that starts from centroids.
         images: the folder, searched with its subfolders, or another source of images
-            (docs/how-to/image-sources.md), or a list of files; not of images that are evaluated on.
+            (docs/how-to/image-sources.md), or a list of files; not images used for evaluation.
         out: the .safetensors file to write.
-        fps: frames a second taken of a video or log, which is then expected; None is one.
-        topic: the topic of images in a robot log; None is the only one.
-        max_images: number of images that are read at most, drawn at random.
-        seed: as `with_vocabulary` takes it, and so are the others.
+        fps: frames per second of a video or log, which `images` must then be; None is one.
+        topic: the image topic of a robot log; None takes the only one.
+        max_images: largest number of images to read, drawn at random.
+        seed: random seed, as in `with_vocabulary`.
         batch_size: number of images described at a time.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
-        The model, and what its vocabulary was built of.
+        The parameters, and the numbers of centroids and images.
 
     Raises:
         InputError: what `with_vocabulary` raises; no image; or a file that cannot be written.
@@ -251,7 +250,7 @@ def _check_vocabulary(config: ModelConfig) -> None:
 def _read_features(
     model: Model, paths: Sequence[pathlib.Path], reading: Reading, seed: int, *, quiet: bool
 ) -> list[Float32[np.ndarray, "feature dim"]]:
-    """Read unit features of each image, of `PATCHES` patches; those of zeros are left out."""
+    """Read unit features of up to `PATCHES` patches of each image, without those of zeros."""
     config = model.config
     devices = devices_for(reading.batch_size)
     params = devices.replicate(cast_params(model.params, config))
@@ -276,15 +275,15 @@ def _read_features(
 def k_majority(
     features: Float[np.ndarray, "feature dim"], clusters: int, seed: int
 ) -> Float32[np.ndarray, "cluster dim"]:
-    """Cluster binary features by the bits that differ; a centroid has the majority's bits.
+    """Cluster binary features by Hamming distance; a centroid has the majority's bits.
 
     It is the clustering of Galvez-Lopez and Tardos (T-RO 2012), without a tree: the first centroids
-    are drawn as k-means++ draws them, and what has no majority keeps its bit.
+    are drawn as in k-means++, and a bit without a majority stays the same.
 
     Args:
-        features: of two values, as `Backbone.binary` says.
+        features: features of two values; see `Backbone.binary`.
         clusters: number of centroids.
-        seed: draws the first ones.
+        seed: draws the first centroids.
     """
     size = np.abs(features).max()
     bits = np.sign(features).astype(np.float32)
@@ -294,7 +293,7 @@ def k_majority(
     while len(chosen) < clusters:
         away = np.minimum(away, (bits.shape[1] - bits @ bits[chosen[-1]]) / 2)
         weights = np.square(away)
-        # Once all features are a centroid, the rest are drawn alike.
+        # Once every feature is a centroid, the rest are drawn uniformly.
         shares = weights / weights.sum() if weights.any() else None
         chosen.append(int(generator.choice(len(bits), p=shares)))
     centroids, nearest = bits[chosen], np.zeros(len(bits), int)
@@ -313,8 +312,8 @@ def k_majority(
 def _k_means(
     features: Float[np.ndarray, "feature dim"], clusters: int, seed: int, *, spherical: bool
 ) -> Float32[np.ndarray, "cluster dim"]:
-    """Return the means of clusters; with `spherical` of those nearest by the angle."""
-    import faiss as _faiss  # imported here: most of training does without it
+    """Return the means of clusters; with `spherical`, of clusters formed by angle."""
+    import faiss as _faiss  # imported here: most of training does not need it
 
     faiss: Any = _faiss
     kmeans = faiss.Kmeans(
@@ -331,7 +330,7 @@ def _k_means(
     kmeans.train(features)
     if not spherical:
         return kmeans.centroids
-    # faiss makes the means unit vectors, which moves no feature to another cluster.
+    # faiss scales the means to unit vectors, which moves no feature to another cluster.
     nearest = kmeans.index.search(features, 1)[1][:, 0]
     means = kmeans.centroids.copy()
     for cluster in np.unique(nearest):

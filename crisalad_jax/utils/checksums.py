@@ -1,7 +1,7 @@
 """Checksums: a file that this package writes holds the SHA-256 of its own bytes.
 
-The digest is part of the file's text, and is computed as if its digits were zeros there. So every
-byte of the file counts.
+The digest is part of the file's text, and is computed with zeros in place of its digits, so that
+every byte of the file counts.
 """
 
 import hashlib
@@ -25,14 +25,14 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 
 
 def checksummed_json(value: Mapping[str, Any], indent: int | None = None) -> bytes:
-    """Return an object as the bytes of a JSON file, with its checksum ahead of all other keys."""
+    """Return an object as the bytes of a JSON file, with its checksum before all other keys."""
     blank = {CHECKSUM: _BLANK} | {**value, CHECKSUM: _BLANK}
     data = (json.dumps(blank, indent=indent) + "\n").encode()
     return data.replace(_BLANK.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
 
 
 def check_checksum(data: bytes, digest: Any, path: object) -> None:
-    """Check that a file's bytes have the checksum that is among them.
+    """Check a file's bytes against the checksum that they contain.
 
     Args:
         data: the bytes.
@@ -40,7 +40,7 @@ def check_checksum(data: bytes, digest: Any, path: object) -> None:
         path: the file, for the message.
 
     Raises:
-        ChangedFileError: they do not.
+        ChangedFileError: they do not match.
     """
     blank = data.replace(str(digest).encode(errors="replace"), _BLANK.encode(), 1)
     if hashlib.sha256(blank).hexdigest() != digest:
@@ -48,7 +48,7 @@ def check_checksum(data: bytes, digest: Any, path: object) -> None:
 
 
 class ChangedFileError(InputError):
-    """A file whose bytes do not have their checksum."""
+    """A file whose bytes do not match their checksum."""
 
     def __init__(self, path: object) -> None:
         """Take the file, for the message."""
@@ -59,5 +59,5 @@ class ChangedFileError(InputError):
 
 
 def tell_unchecked(path: object, missing: str = "no checksum") -> None:
-    """Warn that a file, as of another program, has no checksum."""
+    """Warn that a file, such as one of another program, has no checksum."""
     warn(f"{path}: found {missing}, as of other programs; not checked")

@@ -1,6 +1,6 @@
 """A Ray cluster: join or start it, check its nodes, and call a function on all of them.
 
-This is the only module that knows how to reach Ray.
+This is the only module that connects to Ray.
 """
 
 import collections
@@ -40,11 +40,11 @@ CONNECT, ANSWER, START, RESULT = 60.0, 120.0, 300.0, 1800.0
 """Seconds to wait at most: for a cluster, for its nodes' answers, for the first worker, and for any
 worker's result."""
 _REASON = 300
-"""Letters of what Ray says of a worker's end."""
+"""Most characters to quote from Ray's message about the end of a worker."""
 _STARTS = -1
-"""In place of an item's number: its worker starts."""
+"""In place of an item's number: its worker is starting."""
 _TRIES = 5
-"""Times that the worker of one item, or any that starts, may end."""
+"""How many workers may end at the same item, or while they start, before this is an error."""
 
 
 def check_cluster(address: str | None) -> tuple[str, int] | None:
@@ -68,10 +68,10 @@ def connected(address: str) -> Iterator[Any]:
     """Join or start a Ray cluster for the block, and yield the module `ray`.
 
     Ray's own banners, logs and telemetry are off, and signals keep their handlers. If this process
-    has joined a cluster already, that one is used, and stays.
+    has already joined a cluster, that one is used, and stays connected.
 
     Args:
-        address: "local" starts Ray on this machine and ends it afterwards; "auto" joins the
+        address: "local" starts Ray on this machine and stops it afterwards; "auto" joins the
             cluster that this machine is a node of; ray://HOST[:PORT] joins as a client;
             HOST:PORT is the address of a cluster that this machine is a node of.
 
@@ -115,7 +115,7 @@ def _check_port(what: str, host: str, port: int) -> None:
 
 def _join(ray: Any, address: str, what: str) -> None:
     """Start or join the cluster, without its output."""
-    # What Ray prints of the death of a worker goes to standard output, which may be JSON.
+    # Ray reports the death of a worker on standard output, which may be JSON.
     ray._private.worker.print_to_stdstream = lambda *_, **__: None
     logging.getLogger("ray").setLevel(logging.CRITICAL)
     options = {"log_to_driver": False, "logging_level": logging.CRITICAL}
@@ -123,21 +123,21 @@ def _join(ray: Any, address: str, what: str) -> None:
         warnings.simplefilter("ignore")
         try:
             if address == "local":
-                # In this thread: the kernel ends Ray's processes with the one that started them.
+                # In this thread: the kernel ends Ray's processes with the thread that started them.
                 before = signal.getsignal(signal.SIGTERM)
                 ray.init("local", num_cpus=usable_cores(), include_dashboard=False, **options)
                 if threading.current_thread() is threading.main_thread():
                     signal.signal(signal.SIGTERM, before)
                 return
             joined = _within(CONNECT, lambda: ray.init(address, **options))
-        except Exception as error:  # Ray raises many
+        except Exception as error:  # Ray raises many types
             raise InputError(f"{what}: cannot be joined: {_reason(error)}") from error
     if not joined:
         raise InputError(f"{what}: found no answer of a Ray cluster within {CONNECT:.0f} s")
 
 
 def _reason(error: Exception) -> str:
-    """Say in one line what Ray says, or the last line of a remote traceback."""
+    """Return Ray's message in one line, or the last line of a remote traceback."""
     lines = str(error).strip().splitlines()
     return one_line(lines[-1] if "Traceback" in str(error) else error)
 
@@ -164,7 +164,7 @@ def check_nodes(ray: Any, *, read: Sequence[str] = (), write: pathlib.Path | Non
     """Check that every node has this package, and the files that this machine has.
 
     Args:
-        ray: of `connected`.
+        ray: the module, from `connected`.
         read: absolute paths and addresses (s3://...) that nodes have to read.
         write: absolute path of an existing folder that they all have to share and write into.
 
@@ -196,7 +196,7 @@ def check_nodes(ray: Any, *, read: Sequence[str] = (), write: pathlib.Path | Non
 
 
 def _look_by_value() -> Callable[[Mapping[str, str], list[str], str | None], list[str]]:
-    """Return what lists a node's problems: Ray sends it whole, as nodes may lack this package."""
+    """Return the function that lists a node's problems; it runs on nodes that lack this package."""
 
     def look(expected: Mapping[str, str], paths: list[str], mark: str | None) -> list[str]:
         import importlib
@@ -222,7 +222,7 @@ def _look_by_value() -> Callable[[Mapping[str, str], list[str], str | None], lis
                     files.cat_file(there, start=0, end=1)
                 else:
                     os.listdir(path) if os.path.isdir(path) else open(path, "rb").close()
-            except Exception as error:  # each file system has its own
+            except Exception as error:  # each file system raises its own
                 reason = f"{type(error).__name__}: {error}"
                 problems.append(f"cannot read {path}, as this machine can ({reason})")
         if mark is not None:
@@ -245,7 +245,7 @@ def _nodes(ray: Any) -> list[dict[str, Any]]:
 def _slots(ray: Any) -> tuple[int, dict[str, float]]:
     """Return how many workers a cluster has room for, and the resources of each.
 
-    A worker has a GPU; where no node has one, the CPUs of the smallest node.
+    A worker has a GPU; if no node has one, the CPUs of the smallest node.
     """
     all_of = [node["Resources"] for node in _nodes(ray) if node["Resources"].get("CPU", 0) >= 1]
     with_gpus = [each for each in all_of if each.get("GPU", 0) >= 1]
@@ -257,16 +257,16 @@ def _slots(ray: Any) -> tuple[int, dict[str, float]]:
 
 
 class _Worker:
-    """What calls a function in a process of a node, where it stays in memory."""
+    """An actor that calls a function in a process of a node, where it stays in memory."""
 
     def __init__(self, folder: str, environment: Mapping[str, str]) -> None:
-        """Take the folder of relative paths, if it exists here, and variables."""
+        """Change to the folder of relative paths, if it exists here, and set variables."""
         os.environ.update(environment)
         with contextlib.suppress(OSError):
             os.chdir(folder)
 
     def start(self, prepare: Callable[[], None], held: Sequence[Any]) -> None:
-        """Prepare the process, and take the function, to which there is a reference."""
+        """Prepare the process, and get the function from its reference."""
         import ray
 
         with locate_errors(f"node {socket.gethostname()}: "):
@@ -280,7 +280,7 @@ class _Worker:
 
 
 def with_notes(work: Callable[..., _Result], *given: Any) -> tuple[_Result, list[str]]:
-    """Return a function's result, and the notes that it gives, for another process to give."""
+    """Return a function's result, and its notes, for another process to show."""
     with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always", Note)
         result = work(*given)
@@ -297,19 +297,19 @@ def map_in_order(
 ) -> Iterator[_Result]:
     """Yield the result of `work` for each item, in the order of the items.
 
-    The items of a worker that is lost are given to others, and another is started where there is
-    room. Few items are begun before the first of them is asked for.
+    If a worker is lost, its item goes to another, and a new worker is started where there is room.
+    Only a few items are started ahead of the one that is asked for.
 
     Args:
-        ray: of `connected`.
-        work: a function that pickle can send.
+        ray: the module, from `connected`.
+        work: a function that can be pickled.
         items: what to work on.
         prepare: called in each process before `work` is unpickled.
         environment: variables that are set in each process before that.
 
     Raises:
-        InputError: what `work` raises as one, with the node's name; workers end again and again; or
-            none has a result within `RESULT` seconds.
+        InputError: what `work` raises as one, with the node's name; workers end repeatedly; or none
+            has a result within `RESULT` seconds.
     """
     count, resources = _slots(ray)
     remote = ray.remote(_Worker).options(**resources, scheduling_strategy="SPREAD")

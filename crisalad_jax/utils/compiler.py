@@ -20,21 +20,21 @@ _R = TypeVar("_R", covariant=True)
 _LEAST_MEMORY: dict[str, bool | str] = {
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"
 }
-"""By default XLA copies all weights of a layer out of their stack before the layer runs: half as
-much memory again, and 3 to 5 % slower (`scripts/bench/study_compiler.py`)."""
+"""By default XLA copies all weights of a layer out of their stack before the layer runs. That takes
+half as much memory again, and is 3 to 5 % slower (`scripts/bench/study_compiler.py`)."""
 _AMX = "amx_tile"
 _BY_EIGEN: dict[str, bool | str] = {
     "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_REDUCE"
 }
-"""Products of float32 by Eigen, and by YNN sums alone: on Intel's processors with AMX faster than
-jaxlib's choice of YNN for all, on AMD's slower (docs/performance-studies.md)."""
+"""Eigen for products of float32, and YNN only for sums: faster than jaxlib's choice of YNN for all
+on Intel processors with AMX, slower on AMD's (docs/performance-studies.md)."""
 _AT_REST = get_opaque_trace_state()
-"""What JAX traces while it traces nothing."""
+"""JAX's trace state while it traces nothing."""
 _TESTED = ((0, 10), (0, 12))
 """Versions of JAX that the tests run with: those that pyproject.toml requires."""
 
 
-if jax.__version_info__[:2] not in _TESTED:  # before a crash, whichever way the package is used
+if jax.__version_info__[:2] not in _TESTED:  # before a crash, however the package is used
     tested = " and ".join(".".join(map(str, version)) for version in _TESTED)
     warn(
         f"found jax {jax.__version__}, tested are {tested}: results are not checked, and 0.11 "
@@ -45,12 +45,12 @@ if jax.__version_info__[:2] not in _TESTED:  # before a crash, whichever way the
 def compiler_options(
     *, runs_long: bool = False, compute_dtype: str | None = None
 ) -> dict[str, bool | str]:
-    """Return XLA's options for a program: none but on a CPU, with a tested version of JAX.
+    """Return XLA's options for a program: none, except on a CPU with a tested version of JAX.
 
-    Another version may lack an option, or crash with it; without any a program is as right, and
-    slower at most. A program that `runs_long`, such as a training step, is not ordered for the
-    least memory, which takes it 6 % longer. They depend on the processor, and on the
-    `compute_dtype` of the program's model, None without one.
+    Another version may lack an option, or crash with it; without any, a program is just as correct,
+    at most slower. A program that `runs_long`, such as a training step, is not scheduled for the
+    least memory, which would take it 6 % longer. The options depend on the processor, and on the
+    `compute_dtype` of the program's model, None without a model.
     """
     if target().platform != "cpu" or jax.__version_info__[:2] not in _TESTED:
         return {}
@@ -62,21 +62,21 @@ class Jitted(Protocol[_P, _R]):
     """A compiled function."""
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-        """Compute it."""
+        """Call the function."""
         ...
 
     def lower(self, *args: Any, **kwargs: Any) -> jax.stages.Lowered:
-        """Lower it for the `target`; arguments may be shapes."""
+        """Lower the function for the `target`; arguments may be shapes."""
         ...
 
 
 def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) -> Jitted[_P, _R]:
     """Wrap a function in `jax.jit` with `compiler_options`, outside of other transformations.
 
-    Inside another transformation the outermost `jit` decides, because JAX takes no other options.
-    On accelerators float32 products have the `precision` of a configuration among the arguments,
-    and everywhere numbers are of `number_types`.
-    The returned function has `lower` too, which lowers for the `target`.
+    Inside another transformation the options of the outermost `jit` apply, because JAX accepts no
+    others. On accelerators float32 products have the `precision` of a configuration among the
+    arguments; on all platforms, numbers have the types of `number_types`. The returned function
+    also has `lower`, which lowers for the `target`.
     """
     inner = jax.jit(function, **options)
 
@@ -120,9 +120,9 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
 def number_types(leaves: Sequence[Any] = ()) -> Iterator[None]:
     """Compute in JAX's 32-bit mode, unless a configuration among the `leaves` is of float64.
 
-    A program may be in the 64-bit mode for another package. Numbers without a type of their own, as
-    of `jnp.zeros` or an optimiser's schedule, would be float64 in it, and results other ones. It
-    may also forbid promotion or compiling, which the code here relies on.
+    A program may be in the 64-bit mode for another package. Numbers without an explicit type, as in
+    `jnp.zeros` or an optimiser's schedule, would then be float64, and results would differ. It may
+    also forbid promotion or compilation, which the code here relies on.
     """
     wide = any(getattr(leaf, "compute_dtype", None) == "float64" for leaf in leaves)
     with (
@@ -152,9 +152,9 @@ class Session(NamedTuple):
     platform: str
     """cpu, gpu or tpu."""
     devices: int
-    """Number of devices; a CPU is one for each core."""
+    """Number of devices; a CPU counts as one for each core."""
     cache: str | None
-    """Folder of compiled programs; None where none can be written."""
+    """Folder of compiled programs; None if none can be written."""
 
     def __repr__(self) -> str:
         """Return one line for a notebook."""
@@ -168,7 +168,7 @@ def set_up() -> Session:
     Call it first in a notebook or a program, before JAX is used. The CPU becomes one device for
     each core, which `describe` shards a batch over: that is faster than using all cores for every
     product. Programs that took long to compile are stored in the folder that CRISALAD_CACHE names
-    (by default `~/.cache/crisalad-jax`), if it is writable, so that the next start takes them from
+    (by default `~/.cache/crisalad-jax`), if it is writable, so that the next start loads them from
     there. The environment variables JAX_NUM_CPU_DEVICES, XLA_FLAGS and JAX_COMPILATION_CACHE_DIR
     take precedence.
 
@@ -187,7 +187,7 @@ def set_up() -> Session:
 
 
 def configure(devices: int | None = None) -> None:
-    """Configure devices and the compile cache of `set_up`, and start no device.
+    """Configure devices and the compile cache as `set_up` does, without starting a device.
 
     Args:
         devices: number of devices that the CPU becomes; None is one for each core.

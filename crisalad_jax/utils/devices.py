@@ -15,11 +15,11 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.target import machine, target
 
 SHARD_FROM = 2**14
-"""Smallest number of elements of a sharded array: a gather of smaller ones costs too much."""
+"""Smallest number of elements of a sharded array: gathering smaller ones costs too much."""
 
 
 IMAGE = "image"
-"""Name of the mesh's one axis, over which images are sharded."""
+"""Name of the mesh's only axis, over which images are sharded."""
 _Tree = TypeVar("_Tree")
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -57,7 +57,7 @@ class Devices(NamedTuple):
         return jax.tree.map(put, tree)
 
     def shard(self, tree: _Tree) -> _Tree:
-        """Shard arrays over the devices by `shard_spec`; all processes give the same whole ones."""
+        """Shard arrays over the devices by `shard_spec`; all processes give the same full ones."""
 
         def put(leaf: Any) -> jax.Array:
             host = np.array(leaf)
@@ -68,7 +68,7 @@ class Devices(NamedTuple):
         return jax.tree.map(put, tree)
 
     def gather(self, tree: _Tree) -> _Tree:
-        """Gather arrays: replicated ones on one device, sharded ones whole on the host.
+        """Gather arrays: replicated ones on one device, sharded ones in full on the host.
 
         Arrays are gathered one after the other, so that no device holds all of them. All processes
         must call it if any array is sharded.
@@ -96,7 +96,7 @@ def shard_spec(mesh: Mesh, shape: tuple[int, ...]) -> NamedSharding:
 
 
 def devices_for(count: int, *, processes: bool = False) -> Devices:
-    """Choose the most devices that divide `count` images, of this process or equally of all.
+    """Choose as many devices as divide `count` images, from this process or equally from all.
 
     Raises:
         InputError: the processes cannot share them.
@@ -113,9 +113,9 @@ def devices_for(count: int, *, processes: bool = False) -> Devices:
 
 
 def parts_for_caches(images: int, at_once: int) -> int:
-    """Return into how many parts a CPU divides a batch, to compute them one after the other.
+    """Return how many parts a CPU splits a batch into, to compute them one after the other.
 
-    Activations of few images stay in its caches. Other platforms take the batch whole.
+    Activations of a few images stay in its caches. Other platforms do not split the batch.
 
     Args:
         images: number of images, which may be spread over devices as `devices_for` chooses them.
@@ -134,17 +134,17 @@ def parts_for_caches(images: int, at_once: int) -> int:
 
 
 def over_images(argument: str, position: int) -> Callable[[_F], _F]:
-    """Make a decorator that tells a compiled function over which devices its images are sharded.
+    """Make a decorator that gives a compiled function the devices its images are sharded over.
 
-    The traced function sees the mesh by `image_mesh`. The sharding of an argument is known before
-    the trace, not in it.
+    The traced function gets the mesh from `image_mesh`. The sharding of an argument is known before
+    tracing, not during it.
 
     Args:
         argument: name of an argument with a leading image axis.
         position: its place among the arguments.
 
     Returns:
-        The decorator; it keeps `lower`.
+        The decorator; it preserves `lower`.
     """
 
     def decorate(function: _F) -> _F:
@@ -178,18 +178,18 @@ def _shared(images: Any) -> contextlib.AbstractContextManager[Any]:
 
 
 def image_mesh() -> AbstractMesh | None:
-    """Return the devices over which the traced function's images are sharded; None for one alone.
+    """Return the devices that the traced function's images are sharded over; None for just one.
 
-    Within `jax.shard_map`, where a device sees its own images alone, it is None too.
+    It is also None within `jax.shard_map`, where a device sees only its own images.
     """
     mesh = jax.sharding.get_abstract_mesh()
     return mesh if mesh.axis_names == (IMAGE,) and mesh.axis_types == (AxisType.Auto,) else None
 
 
 def whole_on_each(function: Callable[..., _Tree]) -> Callable[..., _Tree]:
-    """Make a function of gathered arrays that every device computes whole.
+    """Wrap a function of gathered arrays so that every device computes all of it.
 
-    XLA would otherwise split it, and exchange its parts. On one device it is the function itself.
+    XLA would otherwise split it, and exchange its parts. On one device the function is unchanged.
     """
     mesh = image_mesh()
     if mesh is None:

@@ -1,4 +1,4 @@
-"""Download a file: tried again after a fault, resumed after a cut, and never half a file."""
+"""Download a file, with retries and resumption; the target is never a partial file."""
 
 import dataclasses
 import http.client
@@ -16,19 +16,19 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.version import VERSION
 
 OFFLINE = "CRISALAD_OFFLINE"
-"""Variable of the environment: whether to use no network."""
+"""Environment variable: whether to use no network."""
 _CHUNK = 2**18
 _MEGABYTE = 1e6
 _PARTIAL, _NO_SUCH_RANGE = 206, 416
 _PASSING = (408, _NO_SUCH_RANGE, 425, 429, 500, 502, 503, 504)
-"""Codes of HTTP after which the same request, or one for the whole file, may succeed."""
+"""HTTP status codes after which the same request, or one for the whole file, may succeed."""
 _GONE = (404, 410)
 _TIMEOUT = 30.0
-"""Seconds without an answer before a server is given up."""
+"""Seconds without an answer before an attempt fails."""
 _ATTEMPTS = 5
-"""Attempts in a row that bring less than a megabyte."""
+"""Consecutive attempts that bring less than a megabyte, before the download fails."""
 _PAUSE = 1.0
-"""Seconds before the second attempt; each further one waits twice as long."""
+"""Seconds before the second attempt; the wait doubles for each further one."""
 
 
 def is_offline() -> bool:
@@ -45,24 +45,25 @@ class _PassingFault(Exception):
 
 
 def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False) -> None:
-    """Download a file to `target`, which appears when it is whole.
+    """Download a file to `target`, which appears only when it is complete.
 
-    The beginning of an unfinished file stays next to it, as `target`.part, with what the server
-    says of it. The next call resumes from there if the server still has the same file: the same
-    length, and the same ETag or time of change. A server that names neither starts again.
+    The beginning of an unfinished file stays next to it, as `target`.part, with the server's
+    description of it. The next call resumes from there if the server still has the same file: the
+    same length, and the same ETag or modification time. If it gives neither, the next call starts
+    again.
 
     Proxies are those of the environment: `http_proxy`, `https_proxy`, `no_proxy`.
 
     Args:
         url: the address, of http, https or file.
-        target: the file, in a folder that is there and that no other process writes to.
-        label: what is written in front of the progress bar.
+        target: the file, in an existing folder that no other process writes to.
+        label: text in front of the progress bar.
         quiet: no progress bar.
 
     Raises:
         MissingFileError: the file does not exist.
-        InputError: the server refuses, stalls or fails in every attempt; or the disk is full. Only
-            then the unfinished file does not stay.
+        InputError: the server refuses, stalls or fails in every attempt; or the disk is full, the
+            only case in which the unfinished file is removed.
 
     Example:
         >>> _ = (folder / "there.txt").write_text("all of it")
@@ -92,16 +93,16 @@ def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False)
 
 @dataclasses.dataclass(frozen=True)
 class _Remote:
-    """What a server says of a file, by which its beginning is known again."""
+    """A server's description of a file, which identifies its beginning later."""
 
     url: str
     length: int | None
     validator: str | None
-    """Its strong ETag (equal weak ones may be of unequal bytes), else its time of change."""
+    """Its strong ETag (files with equal weak ones may differ), else its modification time."""
 
 
 class _Part:
-    """An unfinished file, and the note of whose beginning it is."""
+    """An unfinished file, and a note of which file it is the beginning of."""
 
     def __init__(self, target: pathlib.Path) -> None:
         self.target = target
@@ -112,7 +113,7 @@ class _Part:
         return self.path.stat().st_size if self.path.is_file() else 0
 
     def begin(self, remote: _Remote) -> None:
-        self.discard()  # first: a note is of the bytes next to it
+        self.discard()  # first: a note describes the bytes next to it
         write_json(self._note, dataclasses.asdict(remote))
 
     def discard(self) -> None:
@@ -120,7 +121,7 @@ class _Part:
         self._note.unlink(missing_ok=True)
 
     def begun(self, url: str) -> _Remote | None:
-        """Return whose beginning this is; None where another file would not be noticed."""
+        """Return which file was begun; None if a different file would not be noticed."""
         try:
             begun = _Remote(**read_json(self._note, "a note of a download"))
         except InputError:
@@ -133,7 +134,7 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
     """Fetch the file, or what is missing after its beginning.
 
     Raises:
-        _PassingFault: it did not all arrive, or is not the file that was begun.
+        _PassingFault: not all of it arrived, or it is not the file that was begun.
         InputError: what `download` raises.
     """
     begun = part.begun(url)
@@ -147,7 +148,7 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
         remote, span = _remote(url, response.headers), response.headers.get("Content-Range", "")
         if not begun or response.status != _PARTIAL:
             start = 0  # the whole file, whether or not its beginning is here
-        # An answer to `If-Range` need not repeat the time of change.
+        # An answer to `If-Range` need not repeat the modification time.
         elif not span.startswith(f"bytes {start}-") or remote not in (
             begun,
             dataclasses.replace(begun, validator=None),
@@ -165,7 +166,7 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
                 ):
                     for chunk in _chunks(response):
                         file.write(chunk)
-                        file.flush()  # what has arrived outlives a kill
+                        file.flush()  # what has arrived survives a kill
                         bar.advance(len(chunk) / _MEGABYTE)
                     os.fsync(file.fileno())
         except InputError:
@@ -178,7 +179,7 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
 
 
 def _remote(url: str, headers: Mapping[str, str]) -> _Remote:
-    """Read what a server says of the whole file, in an answer with all or a part of it."""
+    """Read a server's description of the whole file, from a full or a partial response."""
     length = headers.get("Content-Range", headers.get("Content-Length", "")).rpartition("/")[2]
     etag = headers.get("ETag", "W/")
     validator = headers.get("Last-Modified") if etag.startswith("W/") else etag
@@ -186,13 +187,13 @@ def _remote(url: str, headers: Mapping[str, str]) -> _Remote:
 
 
 def _open(url: str, headers: dict[str, str], part: _Part) -> Any:
-    """Open an address, and sort what may go wrong there.
+    """Open an address, and classify its errors.
 
     Raises:
         _PassingFault: the same request may succeed, or one for the whole file.
         InputError: it will not succeed.
     """
-    # A new opener reads the environment's proxies of today.
+    # A new opener reads the environment's current proxies.
     opener = urllib.request.build_opener()
     try:
         return opener.open(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT)
@@ -213,7 +214,7 @@ def _open(url: str, headers: dict[str, str], part: _Part) -> Any:
 
 
 def _chunks(response: Any) -> Iterator[bytes]:
-    """Yield what arrives, until it ends.
+    """Yield the parts of a response as they arrive.
 
     Raises:
         _PassingFault: the connection breaks or stalls.

@@ -1,4 +1,4 @@
-"""The errors that a command ends with in one line: bad input, and a signal."""
+"""Errors that end a command with one line: bad input, and a signal."""
 
 import contextlib
 import signal
@@ -11,14 +11,14 @@ _MOST = 3
 class InputError(ValueError):
     """Bad input from outside: a file, a folder, an argument, a configuration field.
 
-    The command line ends with code 2. The message is one line that names the file or argument, what
-    was found and what was expected.
+    The command line exits with code 2. The message is one line that names the file or argument,
+    what was found and what was expected.
     """
 
 
 @contextlib.contextmanager
 def locate_errors(before: str = "", after: str = "") -> Iterator[None]:
-    """Say in the message of an InputError that the block raises where the input is."""
+    """Add where the input is to the message of an InputError that the block raises."""
     try:
         yield
     except InputError as error:
@@ -26,12 +26,12 @@ def locate_errors(before: str = "", after: str = "") -> Iterator[None]:
 
 
 def how_ended(number: int) -> str:
-    """Say by which signal a program ends, in the words of every command."""
+    """Describe the signal that ends a program, the same way for every command."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 
 
 def few(problems: Sequence[str]) -> str:
-    """Join problems to one line: the first three, and how many more there are.
+    """Join problems into one line: the first three, and how many more there are.
 
     Example:
         >>> few([f"{letter} missing" for letter in "abcde"])
@@ -45,6 +45,6 @@ class Interrupted(Exception):
     """A signal asked the program to end, and its work is saved."""
 
     def __init__(self, number: int, where: str = "") -> None:
-        """Take the signal's number, and `where`: in a few words how far the work is."""
+        """Take the signal's number; `where` says in a few words how far the work is."""
         super().__init__(f"{how_ended(number)} {where}".rstrip())
         self.number = number

@@ -1,8 +1,8 @@
-"""Compiled programs on disk, found by what they are traced from: neither traced nor lowered again.
+"""Compiled programs on disk, which are neither traced nor lowered again.
 
-JAX's own compile cache is keyed by the lowered program, so that a start traces and lowers first.
-That takes most of the time to a first descriptor. The key here covers all that a trace depends on:
-the code of this package, the versions of the libraries, settings, configuration and shapes.
+JAX's own compile cache is keyed by the lowered program, so every start has to trace and lower
+first, which takes most of the time to a first descriptor. The key here covers all that a trace
+depends on: the code of this package, library versions, settings, configuration and shapes.
 """
 
 import contextlib
@@ -30,14 +30,14 @@ from crisalad_jax.utils.target import jax_setting
 from crisalad_jax.utils.version import VERSION
 
 _MOST = 128
-"""Largest number of files that are cached: those used last."""
+"""Largest number of files that are cached: the most recently used."""
 _DIGEST = 32
 """Bytes of the digest that a file begins with."""
 _TRACED_WITH = ("jax", "jaxlib", "numpy", "optimistix", "lineax", "equinox")
 _ENABLED = "jax_enable_compilation_cache"
 """JAX's setting: whether its own cache is read and written."""
 _SETTINGS = ("JAX_", "XLA_")
-"""Beginnings of the environment variables that a program depends on."""
+"""Prefixes of the environment variables that a program depends on."""
 
 
 class _Folder:
@@ -47,15 +47,15 @@ class _Folder:
 
 
 def cache_executables() -> None:
-    """Cache compiled programs from now on, in a folder of the user's alone.
+    """Cache compiled programs from now on, in a folder that only the user can write to.
 
-    A program that runs nothing but this package may call it: code that was changed while it ran, as
-    in a notebook, is not part of the key. Where there can be no such folder nothing is cached.
+    A program that runs nothing but this package may call it: code that is changed at run time, as
+    in a notebook, is not part of the key. If there can be no such folder, nothing is cached.
     """
     with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
         folder = user_cache() / "programs"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # What is read from it runs, so nobody else may write there.
+        # What is read from it is executed, so nobody else may write there.
         if _is_ones_own(folder):
             _Folder.path = folder
 
@@ -67,18 +67,18 @@ def cached_executable(
     kwargs: Mapping[str, Any],
     static_argnames: str | Sequence[str] = (),
 ) -> Callable[[], Any] | None:
-    """Find the compiled program for a call: of this process, on disk, or by compiling it.
+    """Find the compiled program for a call, in this process or on disk, or else compile it.
 
     Args:
         function: what is traced, outside of other transformations, for this machine.
-        jitted: the same by `jax.jit`.
+        jitted: the same function under `jax.jit`.
         args: positional arguments of the call.
         kwargs: arguments by name.
         static_argnames: names of those that are part of the program.
 
     Returns:
-        The call of the program; None where none is cached: on accelerators, and of a function that
-        was made within another or has no name, since the key lacks what it has from there.
+        The call of the program; None if programs are not cached: on accelerators, and for a lambda
+        or a function defined in another, since the key does not cover its closure.
     """
     if _Folder.path is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return None
@@ -110,7 +110,7 @@ def cached_executable(
 
 @contextlib.contextmanager
 def _without_jaxs_cache() -> Iterator[None]:
-    """Compile again: what comes from JAX's own cache lacks its functions when cached again."""
+    """Bypass JAX's own cache: programs loaded from it lack their functions when cached again."""
     try:
         with jax_setting(_ENABLED, False):
             compilation_cache.reset_cache()
@@ -164,7 +164,7 @@ def _is_ones_own(path: pathlib.Path) -> bool:
 
 
 def _read(path: pathlib.Path, tree: Any, devices: list[Any]) -> Any:
-    """Load a cached program; None where there is none that is whole and this user's own."""
+    """Load a cached program; None if there is none that is intact and this user's own."""
     try:
         data = path.read_bytes()
         if not _is_ones_own(path) or hashlib.sha256(data[_DIGEST:]).digest() != data[:_DIGEST]:
@@ -174,13 +174,13 @@ def _read(path: pathlib.Path, tree: Any, devices: list[Any]) -> Any:
             payload, tree, out_tree, execution_devices=devices
         )
         os.utime(path)
-    except Exception:  # of another jaxlib, cut short, or removed meanwhile: it is compiled again
+    except Exception:  # of another jaxlib, truncated, or removed meanwhile: it is compiled again
         return None
     return program
 
 
 def _write(path: pathlib.Path, program: Any, tree: Any) -> None:
-    """Cache a program for the next process, and forget those that were not used for long."""
+    """Cache a program for the next process, and remove the least recently used ones."""
     try:
         payload, in_tree, out_tree = serialize_executable.serialize(program)
         if in_tree != tree:

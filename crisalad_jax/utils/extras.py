@@ -17,14 +17,14 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
 }
-"""Modules of each extra, by its name; of two with a module the smaller is first."""
+"""Modules of each extra, by its name; if two have a module, the smaller extra comes first."""
 
 
 def missing_extra(error: ModuleNotFoundError, what: str) -> str:
     """Return a message that names the extra of a missing module, and how to install it.
 
     Raises:
-        ModuleNotFoundError: the error itself, where the module is of no extra.
+        ModuleNotFoundError: the error itself, if no extra has the module.
     """
     name = (error.name or "").partition(".")[0]
     extra = next((extra for extra, modules in EXTRAS.items() if name in modules), None)

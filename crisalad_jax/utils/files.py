@@ -1,4 +1,4 @@
-"""Read regular files, and write files so that a reader never sees half of one."""
+"""Read regular files, and write files so that a reader never sees a partial one."""
 
 import contextlib
 import ctypes
@@ -24,14 +24,14 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 LARGEST = 2**30
-"""Most bytes of a file that is read whole, such as a text or an image: a file that takes no room on
-the disk may claim any number."""
+"""Most bytes of a file that is read into memory, such as a text or an image: a sparse file may
+claim any number."""
 LARGEST_TEXT, _LARGEST_JSON = 2**27, 2**26
-"""The same of texts and of JSON, whose letters and values take many times as much memory."""
+"""The same for texts and JSON, whose characters and values take many times as much memory."""
 
 
 def is_html(start: bytes) -> bool:
-    """Return whether a file that starts so is a page of HTML, sent in place of what was asked for.
+    """Return whether a file that starts like this is an HTML page, sent instead of the real file.
 
     Example:
         >>> is_html(b"<!DOCTYPE html><title>Quota exceeded</title>")
@@ -51,8 +51,8 @@ def check_source(
         largest: most bytes that it may have; None is any number.
 
     Raises:
-        InputError: there is none, one that is larger, or something that is no file: a folder, a
-            pipe, a device. Opening a pipe may wait for ever, and a device may never end.
+        InputError: there is none, it is larger, or it is not a file but a folder, a pipe or a
+            device. Opening a pipe may wait forever, and a device may never end.
     """
     found = _kind_of(path)
     if found == _FILE:
@@ -68,25 +68,25 @@ _KINDS = {stat.S_IFREG: _FILE, stat.S_IFDIR: _FOLDER, stat.S_IFIFO: "a pipe"}
 
 
 def _kind_of(path: str | os.PathLike[str]) -> str:
-    """Describe what there is at `path`."""
+    """Describe what `path` is."""
     try:
         return _KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "a device or a socket")
     except (FileNotFoundError, NotADirectoryError):
         return _NOTHING
-    except (OSError, ValueError) as error:  # links in a circle, a NUL in the name
+    except (OSError, ValueError) as error:  # circular links, a NUL in the name
         return f"a name that cannot be made or read ({getattr(error, 'strerror', error)})"
 
 
 CACHE = "CRISALAD_CACHE"
-"""Variable of the environment: the folder of all that this package caches."""
+"""Environment variable: the folder of everything that this package caches."""
 
 
 def user_cache() -> pathlib.Path:
-    """Return the folder of all that this package caches, which need not be there yet.
+    """Return the folder of everything that this package caches, which need not exist yet.
 
-    It is what `CRISALAD_CACHE` names, else `crisalad-jax` in the user's cache, which
-    `XDG_CACHE_HOME` may name; a relative name there is ignored, as the XDG Base Directory
-    Specification has it. Its folders are models, exports, programs, teachers, xla and numba.
+    It is `CRISALAD_CACHE`, or else `crisalad-jax` in the user's cache folder, which
+    `XDG_CACHE_HOME` may set; a relative path there is ignored, as the XDG Base Directory
+    Specification requires. Its folders are models, exports, programs, teachers, xla and numba.
 
     Raises:
         RuntimeError: the user has no home folder.
@@ -108,7 +108,7 @@ def read_bytes(path: str | os.PathLike[str], expected: str, *, largest: int = LA
         largest: most bytes that it may have.
 
     Raises:
-        InputError: as `check_source`.
+        InputError: what `check_source` raises.
         PermissionError: the file may not be read.
     """
     check_source(path, expected, largest=largest)
@@ -116,10 +116,10 @@ def read_bytes(path: str | os.PathLike[str], expected: str, *, largest: int = LA
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:
-    """Read a file of UTF-8 text of at most `LARGEST_TEXT` bytes, a byte order mark left out.
+    """Read a UTF-8 text file of at most `LARGEST_TEXT` bytes, without a byte order mark.
 
     Raises:
-        InputError: as `read_bytes`, or other bytes.
+        InputError: what `read_bytes` raises, or the bytes are not UTF-8.
     """
     try:
         return read_bytes(path, expected, largest=LARGEST_TEXT).decode("utf-8-sig")
@@ -138,8 +138,8 @@ def parse_json(text: str | bytes, source: str, expected: str) -> Any:
         expected: what it should hold.
 
     Raises:
-        InputError: it is no JSON, has a key twice in an object, or is nested deeper than any that
-            this package writes.
+        InputError: it is not JSON, has a key twice in an object, or is nested deeper than anything
+            that this package writes.
     """
     try:
         return json.loads(text, object_pairs_hook=_each_once)
@@ -149,7 +149,7 @@ def parse_json(text: str | bytes, source: str, expected: str) -> Any:
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Make an object of JSON, of whose equal keys Python would take the last without a word."""
+    """Make a JSON object, and reject equal keys, of which Python would silently take the last."""
     value = dict(pairs)
     if len(value) < len(pairs):
         keys = [key for key, _ in pairs]
@@ -164,13 +164,13 @@ def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = Tru
     Args:
         path: the file.
         expected: what kind of file, for messages.
-        sealed: whether the file must hold a checksum; who edits a configuration removes it.
+        sealed: whether the file must hold a checksum; users who edit a configuration remove it.
 
     Returns:
-        The value, without its checksum; an object where the file must hold one.
+        The value, without its checksum; an object if the file must hold one.
 
     Raises:
-        InputError: as `read_bytes` and `parse_json`; or the bytes are not those that were written.
+        InputError: what `read_bytes` and `parse_json` raise; or the checksum does not match.
     """
     data = read_bytes(path, expected, largest=_LARGEST_JSON)
     value = parse_json(data, str(path), expected)
@@ -182,23 +182,22 @@ def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = Tru
 
 
 def real_path(path: str | os.PathLike[str]) -> pathlib.Path:
-    """Return the absolute path without links; unlike pathlib it takes links in a circle."""
+    """Return the absolute path without links; unlike pathlib it accepts circular links."""
     return pathlib.Path(os.path.realpath(path))
 
 
 def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> None:
-    """Check that a file can be made at `path`, before the work whose result it is to hold.
+    """Check that a file can be made at `path`, before the work that produces it.
 
-    Nothing is made yet: work that fails leaves no empty folders.
+    Nothing is made yet, so that work that fails leaves no empty folders.
 
     Args:
         path: the file.
         suffix: what its name has to end with, as in ".safetensors"; None is anything.
 
     Raises:
-        InputError: `path` is a folder itself, or a pipe or a device, whose place a file would take;
-            no file can have such a name, or its folder cannot be made or written to; or it has
-            another suffix.
+        InputError: `path` is a folder, or a pipe or a device that a file would replace; no file can
+            have such a name, or its folder cannot be made or written to; or it has another suffix.
     """
     path = pathlib.Path(path)
     if path.name in ("", "-"):
@@ -209,20 +208,20 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
 
 
 def check_folder(path: str | os.PathLike[str]) -> None:
-    """Check that files can be made in a folder, which may have to be made too.
+    """Check that files can be made in a folder, which need not exist yet.
 
     Raises:
-        InputError: as `check_target`.
+        InputError: what `check_target` raises.
     """
     _check_place(path, _FOLDER, "a folder or nothing yet")
 
 
 def check_new_folder(path: str | os.PathLike[str]) -> None:
-    """Check that a folder can be made at `path`, where there may be an empty one.
+    """Check that a folder can be made at `path`, which may be an empty one already.
 
     Raises:
-        InputError: there is a file, or a folder that holds something or that this runs in; or
-            nothing can be made there.
+        InputError: `path` is a file, a folder that is not empty, or the working directory; or it
+            cannot be made.
     """
     path = pathlib.Path(path)
     _check_place(path, _FOLDER, "a new or empty folder")
@@ -233,18 +232,18 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
 
 
 def check_no_links(folder: pathlib.Path, *, itself: bool = False) -> None:
-    """Check that nothing in a folder is a link, through which work there would change other files.
+    """Check that nothing in a folder is a link, through which writes would change other files.
 
     Args:
         folder: the folder, which need not exist; it may come from somebody else.
-        itself: whether the folder may not be a link either, as one whose name is not the user's.
+        itself: whether the folder must not be a link either, as for one that the user did not name.
 
     Raises:
         InputError: a file or a folder in it, at any depth, is a link.
     """
     if itself and folder.is_symlink():
         raise InputError(f"{folder}: found a link, expected the file or folder itself")
-    # A tenth of what `rglob` takes: a map may have many images that were added to it.
+    # It takes a tenth of the time of `rglob`: many images may have been added to a map.
     with os.scandir(folder) if folder.is_dir() else contextlib.nullcontext(()) as entries:
         for entry in entries:
             if entry.is_symlink():
@@ -254,7 +253,7 @@ def check_no_links(folder: pathlib.Path, *, itself: bool = False) -> None:
 
 
 def _check_place(path: str | os.PathLike[str], kind: str, expected: str) -> None:
-    """Check that there is a `kind` of thing at `path`, or can be one."""
+    """Check that `path` is of this `kind`, or can be made."""
     path = pathlib.Path(path)
     found = _kind_of(path)
     if found not in (kind, _NOTHING):
@@ -262,7 +261,7 @@ def _check_place(path: str | os.PathLike[str], kind: str, expected: str) -> None
     places = path.parents if kind == _FILE else (path, *path.parents)
     nearest = next(place for place in places if place.exists())
     try:
-        # A folder's permissions say nothing of /proc or of a disk that is only read.
+        # A folder's permissions say nothing about /proc or about a read-only disk.
         tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:
         raise InputError(
@@ -271,11 +270,11 @@ def _check_place(path: str | os.PathLike[str], kind: str, expected: str) -> None
 
 
 def check_format(what: str, path: str | os.PathLike[str], *suffixes: str) -> None:
-    """Check that a file's name says no other format than the file will have.
+    """Check that a file's suffix matches the format that the file will have.
 
     Args:
         what: the flag, for the message.
-        path: the file; a name without a suffix says nothing.
+        path: the file; a name without a suffix is accepted.
         suffixes: what it may end with, as in ".json".
 
     Raises:
@@ -289,7 +288,7 @@ def check_format(what: str, path: str | os.PathLike[str], *suffixes: str) -> Non
 
 @contextlib.contextmanager
 def wrap_os_errors(path: pathlib.Path) -> Iterator[None]:
-    """Turn an error of the disk in this block into one line that names the file.
+    """Turn a disk error in this block into one line that names the file.
 
     Raises:
         InputError: in place of any `OSError`.
@@ -314,7 +313,7 @@ def atomic_path(
         path: the file.
         within: a folder on the same disk for the temporary file, which its owner clears; None is
             the folder of `path`.
-        durable: whether to sync the file to disk, safe from power failure.
+        durable: whether to sync the file to disk, so that it survives a power failure.
 
     Raises:
         InputError: what `check_target` raises; or the disk is full, or fails.
@@ -348,7 +347,7 @@ def _sync(path: pathlib.Path) -> None:
 
 
 def write_npy(path: pathlib.Path, array: np.ndarray) -> None:
-    """Write an array as `np.save` does, and raise if the disk gets full (`np.save` may not).
+    """Write an array as `np.save` does, but raise if the disk is full (`np.save` may not).
 
     Raises:
         OSError: the disk is full, or what `open` raises.
@@ -360,7 +359,7 @@ def write_npy(path: pathlib.Path, array: np.ndarray) -> None:
 
 
 def npy_header(dtype: np.dtype, shape: tuple[int, ...]) -> bytes:
-    """Return the bytes before the numbers of an array in C order in a .npy file."""
+    """Return the header of a .npy file for an array in C order."""
     file = io.BytesIO()
     values = {"descr": dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     write_array_header_1_0(file, values)
@@ -371,7 +370,7 @@ def split_markers(page: pathlib.Path, name: str) -> tuple[str, str]:
     """Split a page around the place `name`, which two comments enclose.
 
     Raises:
-        InputError: there is no such page, or it has no place of this name.
+        InputError: there is no such page, or no place of this name in it.
     """
     text = read_text(page, "a page with a place for the table").replace("\r\n", "\n")
     start, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
@@ -384,7 +383,7 @@ def split_markers(page: pathlib.Path, name: str) -> tuple[str, str]:
 
 @contextlib.contextmanager
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
-    """Yield a temporary folder beside `path`; rename it to `path` on success, else remove it.
+    """Yield a temporary folder next to `path`; rename it to `path` on success, else remove it.
 
     Raises:
         InputError: what `check_new_folder` raises, or the parent folder cannot be made.
@@ -398,12 +397,12 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
 
 
 def _renameat2() -> Any:
-    """Return Linux's call of that name; None on other systems."""
+    """Return Linux's function of that name; None on other systems."""
     return getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
 
 
 def exchange(first: pathlib.Path, second: pathlib.Path) -> None:
-    """Give two folders each other's names at once, by Linux's `renameat2`.
+    """Exchange the names of two folders atomically, with Linux's `renameat2`.
 
     Raises:
         InputError: the system or the file system has no such call; both stay as they are.
@@ -417,10 +416,10 @@ def exchange(first: pathlib.Path, second: pathlib.Path) -> None:
 
 
 def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
-    """Write an object as indented JSON with its checksum, whole or not at all.
+    """Write an object as indented JSON with its checksum, atomically.
 
     Raises:
-        InputError: as `atomic_path`.
+        InputError: what `atomic_path` raises.
     """
     data = checksummed_json(value, indent=2)
     with atomic_path(path) as temporary:

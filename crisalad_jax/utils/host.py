@@ -9,7 +9,7 @@ import resource
 
 
 def usable_cores() -> int:
-    """Count the cores that this process may use, where the system tells; else all cores."""
+    """Count the cores that this process may use, if the system reports that; else all cores."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -17,7 +17,7 @@ def usable_cores() -> int:
 
 @functools.cache
 def processor_flags() -> frozenset[str]:
-    """Return the names of what the processor can, as Linux lists them; nothing elsewhere."""
+    """Return the processor's feature flags, as Linux lists them; empty on other systems."""
     with contextlib.suppress(OSError):
         lines = pathlib.Path("/proc/cpuinfo").read_text(encoding="utf-8")
         found = re.search(r"^flags\s*:(.*)$", lines, re.MULTILINE)
@@ -26,7 +26,7 @@ def processor_flags() -> frozenset[str]:
 
 
 def available_memory() -> int:
-    """Return how many bytes of memory programs may still take, or may at most, by what is known."""
+    """Return the bytes of memory that programs can still use, or an upper bound if unknown."""
     found = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     with contextlib.suppress(OSError):
         lines = pathlib.Path("/proc/meminfo").read_text(encoding="utf-8")

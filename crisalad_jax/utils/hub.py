@@ -14,9 +14,9 @@ from crisalad_jax.utils.extras import missing_extra
 
 PREFIX = "hf://"
 _KAGGLE_CACHE = "KAGGLEHUB_CACHE"
-"""Variable of the environment: where Kaggle's client stores what it downloads."""
+"""Environment variable: where Kaggle's client stores what it downloads."""
 _ADDRESS = re.compile(
-    # A `Path` has one slash in the place of two.
+    # A `Path` turns two slashes into one.
     r"hf:/{1,2}(?P<repository>[\w.-]+/[\w.-]+)(@(?P<revision>[^/@]+))?(/(?P<file>.+))?/?"
 )
 
@@ -32,7 +32,7 @@ class HubAddress:
     file: str | None = None
 
     def __str__(self) -> str:
-        """Write it as a user does."""
+        """Write the address as a user does."""
         at = f"@{self.revision}" if self.revision else ""
         return f"{PREFIX}{self.repository}{at}{f'/{self.file}' if self.file else ''}"
 
@@ -48,10 +48,10 @@ def is_hub(address: object) -> bool:
 
 
 def parse_hub(address: object) -> HubAddress:
-    """Read an address at the hub: hf://OWNER/NAME, with @REVISION and /FILE where wanted.
+    """Parse an address at the hub: hf://OWNER/NAME, optionally with @REVISION and /FILE.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not such an address.
 
     Example:
         >>> parse_hub("hf://owner/name@v1/model.safetensors")
@@ -76,16 +76,16 @@ def download_file(
 
     Args:
         address: the repository and the file.
-        is_dataset: whether it is a repository of data.
-        folder: where the file goes, under its path there; None is the hub's cache.
+        is_dataset: whether it is a dataset repository.
+        folder: where to store the file, under its path in the repository; None is the hub's cache.
         quiet: whether to show no progress bar.
 
     Returns:
         The file.
 
     Raises:
-        InputError: there is no such repository, revision or file; it may not be read; the hub does
-            not answer; or the network is forbidden and the cache has no such file.
+        InputError: there is no such repository, revision or file; access is denied; the hub does
+            not answer; or the network is disabled and the cache has no such file.
         ModuleNotFoundError: huggingface_hub is not installed.
     """
     with _extra(address):
@@ -112,7 +112,7 @@ def upload_folder(
     Args:
         folder: the folder.
         address: the repository.
-        message: of the commit.
+        message: the commit message.
         quiet: whether to show no progress bar.
 
     Returns:
@@ -167,7 +167,7 @@ def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -
 
     try:
         with (
-            # An output folder that is not empty is refused, so that nothing there would be resumed.
+            # The client rejects an output folder that is not empty, so nothing could be resumed.
             mock.patch.dict(os.environ, {_KAGGLE_CACHE: str(folder)}),
             open(os.devnull, "w") as nothing,
             contextlib.redirect_stderr(nothing if quiet else sys.stderr),
@@ -182,7 +182,7 @@ def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -
 
 @contextlib.contextmanager
 def _extra(what: object) -> Iterator[None]:
-    """Say which extra has a client that is not installed."""
+    """Name the extra of a client that is not installed."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -191,11 +191,11 @@ def _extra(what: object) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _told(address: HubAddress) -> Iterator[None]:
-    """Tell of the hub's errors in one line, without what its client says of tokens."""
+    """Report the hub's errors in one line, without its client's advice on tokens."""
     from huggingface_hub import errors
 
     absent = f"{OFFLINE} forbids the network" if is_offline() else "the hub does not answer"
-    known = {  # the first that fits: some are kinds of others
+    known = {  # the first that fits: some are subclasses of others
         errors.GatedRepoError: "a repository with terms, expected you to accept them at its page",
         errors.RepositoryNotFoundError: "no such repository, or a private one, expected one",
         errors.RevisionNotFoundError: "no such revision, expected one",
@@ -226,7 +226,7 @@ def _first_line(error: Exception) -> str:
 
 @contextlib.contextmanager
 def _bars(quiet: bool) -> Iterator[None]:
-    """Let the clients show no progress bars while the block runs."""
+    """Hide the clients' progress bars while the block runs, if `quiet`."""
     from huggingface_hub import utils
 
     with contextlib.ExitStack() as stack:

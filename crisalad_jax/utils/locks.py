@@ -23,7 +23,7 @@ from crisalad_jax.utils.temporaries import (
 )
 
 _POLL = 0.2
-"""Seconds between two looks at a lock that another process holds."""
+"""Seconds between two attempts at a lock that another process holds."""
 
 
 @contextlib.contextmanager
@@ -58,7 +58,7 @@ def lock(folder: str | os.PathLike[str], *, wait: float = 0.0) -> Iterator[None]
 
 
 def _acquire(folder: pathlib.Path) -> contextlib.ExitStack | None:
-    """Lock a folder until the returned stack is closed; None where another process holds it."""
+    """Lock a folder until the returned stack is closed; None if another process holds it."""
     path = folder / LOCK
     with block_signals(), contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder))
@@ -68,7 +68,7 @@ def _acquire(folder: pathlib.Path) -> contextlib.ExitStack | None:
                 file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
                 stack.callback(os.close, file)
                 kind = os.fstat(file)
-                # The words below would overwrite the file behind a link.
+                # The text written below would overwrite the file behind a link.
                 if not stat.S_ISREG(kind.st_mode) or kind.st_nlink > 1:
                     raise OSError(errno.EMLINK, "found a hard link or no file, expected a lock")
                 try:
@@ -93,7 +93,7 @@ def staged_folder(out: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """Yield a temporary folder; on success move its files into `out`, pages last, else remove it.
 
     Raises:
-        InputError: as `lock`; or the disk is full.
+        InputError: what `lock` raises; or the disk is full.
     """
     out = pathlib.Path(out)
     with lock(out), wrap_os_errors(out):
@@ -107,7 +107,7 @@ def staged_folder(out: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
 
 
 def _holder(folder: pathlib.Path) -> str:
-    """Name the holder of a folder's lock in brackets; nothing while it is still writing that."""
+    """Name the holder of a folder's lock in brackets; empty while that is still being written."""
     try:
         words = (folder / LOCK).read_text(encoding="utf-8", errors="replace").strip()
     except OSError:

@@ -1,4 +1,4 @@
-"""Read MATLAB's `.mat` files by scipy, which runs nothing of them."""
+"""Read MATLAB's `.mat` files with scipy, which runs no code of them."""
 
 import os
 import struct
@@ -9,7 +9,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
 _COMPRESSED = 15
-"""Type of an element that zlib packed (MAT-File Format, MathWorks, table 1-1)."""
+"""Type of an element that zlib compressed (MAT-File Format, MathWorks, table 1-1)."""
 
 
 def load_mat(
@@ -27,7 +27,7 @@ def load_mat(
         expected: what kind of file, for messages.
         damaged: what the message calls a file that scipy cannot read.
         largest: most bytes that it may have, compressed or not.
-        **options: of `scipy.io.loadmat`.
+        **options: options of `scipy.io.loadmat`.
 
     Raises:
         InputError: the file is missing, too large, damaged, or of MATLAB's format 7.3.
@@ -52,7 +52,7 @@ def load_mat(
 
 
 def _unpacks_to(path: str | os.PathLike[str], largest: int) -> bool:
-    """Return whether the compressed elements of a file of version 5 unpack to so many bytes."""
+    """Return whether compressed elements of a version 5 file unpack to at most `largest` bytes."""
     with open(path, "rb") as file:
         order = {b"IM": "<", b"MI": ">"}.get(file.read(128)[126:])
         while order and len(tag := file.read(8)) == 8 and largest >= 0:

@@ -1,4 +1,4 @@
-"""What a program says: notes to its user, and text without control characters."""
+"""Output of a program: notes to its user, and text without control characters."""
 
 import contextlib
 import sys
@@ -10,7 +10,7 @@ _PACKAGE = __name__.partition(".")[0]
 
 
 _LONGEST = 8192
-"""Most letters of a message, which may quote a path or a value of any length."""
+"""Most characters of a message, which may quote a path or a value of any length."""
 
 
 class Note(UserWarning):
@@ -20,7 +20,7 @@ class Note(UserWarning):
 def warn(message: str) -> None:
     """Warn the user in one line; the command line prints it, Python code gets a `Note`.
 
-    The warning is of the first line outside of this package that led here.
+    The warning points to the nearest calling line outside of this package.
     """
     level, frame = 1, sys._getframe()
     while frame is not None and frame.f_globals.get("__name__", "").startswith(_PACKAGE):
@@ -29,11 +29,11 @@ def warn(message: str) -> None:
 
 
 _SAID: set[str] = set()
-"""What `warn_once` has said."""
+"""Messages that `warn_once` has shown."""
 
 
 def warn_once(about: str, message: str) -> None:
-    """Warn of `about: message`, unless this process has said the message before, of anything."""
+    """Warn with `about: message`, unless this process has already shown the message."""
     if message not in _SAID:
         _SAID.add(message)
         warn(f"{about}: {message}")
@@ -52,12 +52,12 @@ def print_notes() -> Iterator[None]:
 
     with warnings.catch_warnings():
         warnings.showwarning = show
-        warnings.simplefilter("default", Note)  # the same words once
+        warnings.simplefilter("default", Note)  # the same message once
         yield
 
 
 def printable(text: str) -> str:
-    """Return a text with its control characters escaped: names of files may hold any.
+    """Return a text with its control characters escaped: file names may contain any.
 
     A terminal would obey them. Line breaks stay.
 

@@ -10,14 +10,14 @@ from crisalad_jax.utils.output import printable
 
 
 class Bar:
-    """A progress bar, or only its messages where no bar is drawn."""
+    """A progress bar, or only its messages if no bar is drawn."""
 
     def __init__(self, progress: Any = None, task: Any = None, *, quiet: bool = True) -> None:
-        """Wrap a task of rich's `progress`; without it there are messages, unless `quiet`."""
+        """Wrap a task of rich's `progress`; without it only messages are shown, unless `quiet`."""
         self._progress, self._task, self._quiet = progress, task, quiet
 
     def advance(self, count: float, note: str = "") -> None:
-        """Advance by `count` units, and show a short note behind the bar."""
+        """Advance by `count` units, and show a short note after the bar."""
         if self._progress is not None:
             self._progress.update(self._task, advance=count, note=note)
 
@@ -39,7 +39,7 @@ def progress_bar(
         label: what the work is.
         total: number of units.
         unit: what is counted, for the rate.
-        quiet: show nothing.
+        quiet: whether to show nothing.
         done: units that were done before, which do not count for the rate.
     """
     if quiet:
@@ -64,7 +64,7 @@ def progress_bar(
             return rich.text.Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
 
     console = rich.console.Console(stderr=True)
-    # The note alone gives way where the terminal is narrow: no other column wraps.
+    # Only the note is shortened on a narrow terminal: no other column wraps.
     whole = functools.partial(rich.table.Column, no_wrap=True)
     progress = parts.Progress(
         parts.TextColumn("{task.description}"),

@@ -20,7 +20,7 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
     Unflattening bypasses `__init__`. JAX also builds trees of shapes, labels or masks from the same
     structure, which must not be checked against the annotations of arrays.
 
-    `repr` tells names, types and shapes, and no values (`summary`), unless the class has its own.
+    `repr` shows names, types and shapes, but no values (`summary`), unless the class has its own.
 
     Args:
         cls: a class with annotated fields.
@@ -65,7 +65,7 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
 def check_drawn(tree: Any, where: str) -> None:
     """Check that new parameters are float32 arrays.
 
-    An array of no numbers is no parameter: optimisers divide by its size. None stands for it.
+    An empty array cannot be a parameter, because optimisers divide by its size: use None instead.
 
     Raises:
         InputError: naming `where` and the first leaf that is not.
@@ -83,12 +83,12 @@ def expect_like(name: str, found: Any, wanted: Any) -> None:
     """Check that what a plug-in returned has the structure, shapes and types that it should have.
 
     Args:
-        name: of the plug-in, with which the message begins.
+        name: the plug-in's name, which begins the message.
         found: what it returned.
         wanted: a tree of arrays or of their shapes.
 
     Raises:
-        InputError: it has not.
+        InputError: it does not.
 
     Example:
         >>> import numpy as np
@@ -134,22 +134,22 @@ def named_leaves(tree: Any) -> dict[str, Any]:
 
 
 _MOST = 24
-"""Number of lines of a printed tree, where its first names are no more."""
+"""Most lines of a printed tree, unless it has more top-level names."""
 
 
 def summary(tree: Any) -> str:
-    """Write a line for each leaf, its name, shape and type, and the totals below.
+    """Write a line for each leaf, with its name, shape and type, and the totals below.
 
-    In a larger tree, a line has the number of the leaves whose names begin alike, and of their
+    In a larger tree, a line counts all leaves whose names have the same prefix, and their
     parameters, so that there are at most `_MOST` lines; `named_leaves` has all. Values are neither
-    read nor computed, so leaves may be arrays of any kind, tracers or `jax.ShapeDtypeStruct`. Where
-    a field is None there is no leaf. Of a leaf without a shape the line has its class.
+    read nor computed, so leaves may be arrays of any kind, tracers or `jax.ShapeDtypeStruct`. A
+    field that is None has no leaf. For a leaf without a shape, the line has its class.
 
     Args:
         tree: a pytree, such as a model's parameters.
 
     Returns:
-        The lines; parameters are the numbers in all arrays.
+        The lines; parameters are the elements of all arrays.
 
     Example:
         >>> import jax
@@ -180,7 +180,7 @@ def _by_prefix(leaves: Mapping[str, Any], depth: int) -> dict[str, dict[str, Any
 
 
 def _row(prefix: str, group: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return name, shape and type of a single leaf; of several how many, and their parameters."""
+    """Return name, shape and type of one leaf; of several, the counts of leaves and parameters."""
     (name, leaf), *more = group.items()
     if more:
         return prefix, f"{len(group)} leaves", f"{_count(group.values()):,}"

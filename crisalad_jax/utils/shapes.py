@@ -1,7 +1,7 @@
-"""Types of NumPy arrays with their shapes, for the annotations of modules that run without JAX.
+"""Types of NumPy arrays with their shapes, for annotations in modules that run without JAX.
 
-To who checks types they are jaxtyping's. A program sees NumPy's arrays alone, and does not import
-jaxtyping, which `query` with another runtime would wait for.
+To a type checker they are jaxtyping's. At run time they are plain NumPy arrays, and jaxtyping is
+not imported, which would slow down `query` with another runtime.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -22,14 +22,14 @@ _SHOW_CURSOR = "\x1b[?25h\n"
 
 
 def end_at_signals() -> None:
-    """End this process at a signal with one line, its temporary files removed.
+    """End this process at a signal with one line, and remove its temporary files.
 
     Python runs handlers in the main thread, and not while a library works there: XLA may compile
     for minutes. A second thread then ends the process.
 
-    Nothing is raised. An exception at any moment may be swallowed: inside of an import, of a
-    library's callback or of a destructor. Files with a final name are whole at any moment, so that
-    the end of the process loses nothing else.
+    Nothing is raised, because an exception at an arbitrary moment may be swallowed: in an import, a
+    library's callback or a destructor. Files with a final name are always complete, so ending the
+    process loses nothing else.
     """
     for number in _SIGNALS:
         # Ignored signals, as under nohup, stay ignored.
@@ -43,27 +43,27 @@ def end_at_signals() -> None:
 
 
 _pipe = -1
-"""Gets the number of each signal, for the second thread; -1 where there is none."""
+"""Receives the number of each signal, for the second thread; -1 if there is none."""
 
 
 def watch() -> None:
-    """Watch for signals in a second thread, again before a library works in the main thread.
+    """Watch for signals in a second thread; repeat it before a library works in the main thread.
 
-    orbax writes by uvloop, which takes the watching for itself, and does not give it back.
+    orbax writes with uvloop, which takes over the watching, and does not give it back.
     """
     if _pipe >= 0 and threading.current_thread() is threading.main_thread():
         signal.set_wakeup_fd(_pipe, warn_on_full_buffer=False)
 
 
 _holding = _waiting = 0
-"""How many blocks hold signals back, and the number of a signal that waits for their end."""
+"""Number of blocks that hold signals back, and the signal that waits for their end."""
 
 
 @contextlib.contextmanager
 def block_signals() -> Iterator[None]:
-    """Let a signal end this process after the block: for a few calls that belong together.
+    """Delay the effect of signals until after the block, for a few calls that belong together.
 
-    An example is to make a file, and to note that it has to be removed.
+    An example is creating a file, and registering it for removal.
     """
     global _holding, _waiting
     _holding += 1
@@ -90,7 +90,7 @@ def _end_late(numbers: int) -> None:
     """End the process at a signal that the main thread has not handled after some time.
 
     Args:
-        numbers: a pipe that gets the number of each signal.
+        numbers: a pipe that receives the number of each signal.
     """
     excused = None
     while data := os.read(numbers, 1):
@@ -111,7 +111,7 @@ _leaving = threading.Lock()
 
 
 def _leave(number: int) -> None:
-    _leaving.acquire()  # for ever: one of the threads ends the process
+    _leaving.acquire()  # never released: one of the threads ends the process
     remove_all_in_use()
     with contextlib.suppress(OSError):
         os.write(
@@ -129,7 +129,7 @@ class SignalState:
     def __init__(self, before: Mapping[Any, Any] | None = None) -> None:
         """Start without a signal; `before` are the handlers of signals until now."""
         self.number = 0
-        """Number of the last one; 0 for none."""
+        """Number of the last signal; 0 for none."""
         self.has_work = False
         """Whether there is work that has to be saved; without it a command ends at once."""
         self._at_once = False
@@ -142,7 +142,7 @@ class SignalState:
 
     @contextlib.contextmanager
     def at_once(self) -> Iterator[None]:
-        """Raise `Interrupted` as a signal arrives, in a block that leaves nothing half done."""
+        """Raise `Interrupted` as soon as a signal arrives, in a block that is safe to interrupt."""
         self._at_once = True
         try:
             self.check()
@@ -151,7 +151,7 @@ class SignalState:
             self._at_once = False
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Record a signal, as its handler; the second one means: do not wait."""
+        """Record a signal, as its handler; a second one interrupts without waiting."""
         first, self.number = self.number == 0, number
         earlier = self._before.get(number)
         if earlier is _end and not self.has_work:
@@ -168,8 +168,8 @@ class SignalState:
 def defer_signals() -> Iterator[SignalState]:
     """Defer SIGTERM, SIGHUP and SIGINT (Ctrl-C) to `SignalState.check` while the block runs.
 
-    One that came after the last check has its usual effect after the block. Python sets handlers in
-    the main thread alone: in other threads this changes nothing.
+    A signal after the last check has its usual effect after the block. Python sets handlers only in
+    the main thread: in other threads this changes nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield SignalState()

@@ -1,4 +1,4 @@
-"""The platform that a program is traced for: the one place that choices by platform read."""
+"""The platform that a program is traced for, which all platform-dependent choices read here."""
 
 import contextlib
 import dataclasses
@@ -18,7 +18,7 @@ _LOWERED_AS = {"cpu": "cpu", "gpu": "cuda", "tpu": "tpu"}
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A platform, and what the choices of a program depend on there.
+    """A platform, and its properties that the choices of a program depend on.
 
     Example:
         >>> GPU.product_dtype("bfloat16"), CPU.product_dtype("bfloat16")
@@ -26,11 +26,11 @@ class Target:
     """
 
     platform: Platform
-    """The platform; "portable" is any of them, which a program is exported for."""
+    """The platform; "portable" is any of them, for exported programs."""
     cudnn: bool = False
     """Whether cuDNN's fused attention, which never writes scores to memory, compiles there."""
     branches: bool = True
-    """Whether a program may take one of two ways, by numbers that it computes."""
+    """Whether a program may branch on values that it computes."""
 
     def product_dtype(self, dtype: Any) -> Any:
         """Return the fastest output type for a product of matrices of `dtype`, before rounding.
@@ -44,10 +44,10 @@ class Target:
 
 CPU, GPU, TPU = Target("cpu"), Target("gpu", cudnn=True), Target("tpu")
 PORTABLE = Target("portable")
-"""No choice by platform: a program runs on all of them."""
+"""No platform-dependent choices: a program runs on all platforms."""
 STRAIGHT = Target("portable", branches=False)
-"""No choice by platform, and no branches: a program of another format, for any engine."""
-# JAX keeps traces apart by it: a function traced for one target is traced again for another.
+"""No platform-dependent choices and no branches: a program of another format, for any engine."""
+# JAX's trace cache depends on it: a function traced for one target is traced again for another.
 _chosen = jax.make_user_context(None)
 _mesh = jax.make_user_context(None)
 _ONE_DEVICE = AbstractMesh((1,), ("image",), axis_types=(AxisType.Auto,))
@@ -65,7 +65,7 @@ def jax_setting(name: str, value: Any) -> Iterator[None]:
 
 
 def target() -> Target:
-    """Return the target of what is traced now: that of `lowering_for`, or this machine."""
+    """Return the target of the current trace: that of `lowering_for`, or this machine."""
     return _chosen.value or machine()
 
 
@@ -79,18 +79,18 @@ def machine() -> Target:
 
 
 def widens_slices() -> bool:
-    """Return whether XLA widens a stack of bfloat16 arrays, all of it, before a loop slices it.
+    """Return whether XLA widens a whole stack of bfloat16 arrays before a loop slices it.
 
-    A CPU's compiler of jax before 0.11 does (docs/performance-studies.md, Choices by processor).
+    The CPU compiler of jax before 0.11 does (docs/performance-studies.md, Choices by processor).
     """
     return target().platform == "cpu" and jax.__version_info__ < (0, 11)
 
 
 def absent_platforms(error: Exception | None = None) -> str | None:
-    """Describe which platforms `JAX_PLATFORMS` names that this JAX lacks; None where it has them.
+    """Describe the platforms in `JAX_PLATFORMS` that this JAX lacks; None if it has them all.
 
     Args:
-        error: what JAX raised; after it, JAX gives the devices that it started before it failed.
+        error: what JAX raised; after it, JAX returns the devices that it started before it failed.
     """
     named = os.environ.get("JAX_PLATFORMS")
     if not named:
@@ -99,14 +99,14 @@ def absent_platforms(error: Exception | None = None) -> str | None:
         jax.devices()
         if "Unable to initialize backend" not in str(error):
             return None
-    except Exception:  # RuntimeError, or an AssertionError without a word
+    except Exception:  # RuntimeError, or an AssertionError without a message
         jax.config.update("jax_platforms", None)
     here = ", ".join(sorted(backend.backends()))
     return f"JAX_PLATFORMS: found {named!r}, expected platforms that this JAX has: {here}"
 
 
 def _compiles_cudnn() -> bool:
-    """Try a training step's attention to padded tokens, which cuDNN restricts most."""
+    """Try to compile a training step's attention to padded tokens, which cuDNN restricts most."""
     token = jax.ShapeDtypeStruct((1, 72, 1, 64), jnp.bfloat16)
     lengths = jax.ShapeDtypeStruct((1,), jnp.int32)
 
@@ -124,11 +124,11 @@ def _compiles_cudnn() -> bool:
 
 
 def traced_mesh() -> Mesh | AbstractMesh | None:
-    """Return the devices of what is traced now; None where they are not known.
+    """Return the devices of the current trace; None if they are not known.
 
-    A kernel, unlike an operation of XLA, must be told how it is sharded. The devices are those of
-    `jax.set_mesh`, of `over_devices_of`, or the machine's only one. Within `jax.shard_map` a device
-    computes its own images, and it is one device.
+    A kernel, unlike an XLA operation, needs an explicit sharding. The devices are those of
+    `jax.set_mesh`, of `over_devices_of`, or the machine's only one. Within `jax.shard_map` each
+    device computes its own images, so it counts as one device.
     """
     ambient = jax.sharding.get_abstract_mesh()
     if not ambient.empty:
@@ -149,11 +149,11 @@ def over_devices_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[
 
 @contextlib.contextmanager
 def lowering_for(chosen: Target) -> Iterator[None]:
-    """Trace and lower for another platform while the block runs, whether it is here or not.
+    """Trace and lower for another platform while the block runs, whether or not it is present.
 
-    Every choice by platform reads `target`, and becomes that platform's. Traces of other targets
-    are neither used nor changed. For an absent GPU, `scripts/compile_check/absent.py` answers what
-    JAX asks of cuDNN.
+    Every platform-dependent choice reads `target`, and becomes that platform's. Traces of other
+    targets are neither used nor changed. For an absent GPU, `scripts/compile_check/absent.py`
+    answers JAX's queries about cuDNN.
 
     Args:
         chosen: the target, such as `TPU`.
@@ -170,7 +170,7 @@ def lowering_for(chosen: Target) -> Iterator[None]:
 def lowering_platforms() -> tuple[str, ...] | None:
     """Return the platforms to lower for, as `jax.stages.Traced.lower` takes them.
 
-    None is JAX's own choice, outside of `lowering_for` and for a portable program.
+    None leaves the choice to JAX, outside of `lowering_for` and for a portable program.
     """
     name = _LOWERED_AS.get(_chosen.value.platform) if _chosen.value else None
     return None if name is None else (name,)

@@ -1,4 +1,4 @@
-"""Temporary files and locks: their names, and their removal by errors and signals.
+"""Temporary files and locks: their names, and their removal on errors and signals.
 
 This module imports nothing but the standard library, so that the command line can handle signals
 before it imports anything else.
@@ -18,7 +18,7 @@ LOCK = ".crisalad-lock"
 
 
 def holds_other_files(folder: pathlib.Path) -> bool:
-    """Return whether `folder` holds any file, hidden ones included, besides our temporary files."""
+    """Return whether `folder` holds any file, even a hidden one, other than our temporary files."""
     return not all(is_temporary(path) or path.name == LOCK for path in folder.iterdir())
 
 
@@ -94,7 +94,7 @@ def made_folder(folder: pathlib.Path) -> Iterator[None]:
 
 
 def _remove_empty(folders: Sequence[pathlib.Path]) -> None:
-    """Remove those of the folders that are empty; the innermost stand first."""
+    """Remove the folders that are empty; the innermost come first."""
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()

@@ -1,4 +1,4 @@
-"""All formats of public checkpoints, by name: what formats.toml says, and what it cannot.
+"""All formats of public checkpoints, by name: those of formats.toml, and what it cannot express.
 
 Names and shapes are those of each family's public code, and of the torch reference in `parity/`.
 """
@@ -29,13 +29,13 @@ from crisalad_jax.utils.output import one_line, warn
 from crisalad_jax.utils.pytree import named_leaves
 
 VOCABULARY = "anyloc-words"
-"""Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023): the words alone."""
+"""Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023): only the words."""
 REFERENCE = "reference"
 """Name of the format of our torch reference."""
 
 
 def _with_squares(state: State, config: ModelConfig) -> ModelConfig:
-    """Set MixVPR's image size, whose patches are as many as its rows' numbers."""
+    """Set MixVPR's image size, whose number of patches is the width of the row projection."""
     name = "aggregator.row_proj.weight"
     positions = Reader(state).size(name, 1)
     otherwise = f"{name} found for {positions} positions, expected a square number"
@@ -44,14 +44,14 @@ def _with_squares(state: State, config: ModelConfig) -> ModelConfig:
 
 
 def _conv_ap_filter(state: State, config: ModelConfig) -> ModelConfig:
-    """Set the filter by the README: bicubic for the model of 4,096 numbers alone."""
+    """Set the filter as the README says: bicubic only for the model of 4,096 dimensions."""
     assert isinstance(config.aggregator, ConvApConfig)
     name = "bicubic" if config.aggregator.channels == 1024 else "bilinear"
     return dataclasses.replace(config, preprocessing=PreprocessingConfig(filter=name))
 
 
 def _with_ghosts(state: State, config: ModelConfig) -> ModelConfig:
-    """Tell the clusters of the published files from their ghosts, which no shape does."""
+    """Separate the clusters of the published files from their ghosts, which shapes do not show."""
     name = "aggregation.conv.weight"
     count = Reader(state).size(name, 0)
     if count not in (3, 5):
@@ -73,15 +73,15 @@ _ADJUST: dict[str, Callable[[State, ModelConfig], ModelConfig]] = {
 
 
 class _Reference(Format):
-    """The format of our torch reference, for any head. Our files have their configuration."""
+    """The format of our torch reference, for any head. Our files contain their configuration."""
 
     def parts(self) -> dict[str, list[str]]:
-        """Return that it is any over DINOv2 or a CNN."""
+        """Return the allowed parts: any, on DINOv2 or a CNN."""
         parts = {part: ["any"] for part in super().parts()}
         return parts | {"backbone": ["vit", "resnet", "vgg"]}
 
     def backbone_of(self, config: ModelConfig) -> BackboneNames:
-        """Return the names of any such backbone."""
+        """Return the names of any of these backbones."""
         found = parts_of(config)
         names = {"vit": "dinov2", "resnet": "resnet-numbers", "vgg": "vgg-numbers"}
         sides = {"side": "dinov2-side", "side-multi-resolution": "dinov2-sides"}
@@ -89,7 +89,7 @@ class _Reference(Format):
         return _BACKBONES[name]._replace(prefix="backbone.")
 
     def head_of(self, config: ModelConfig) -> Head:
-        """Return the names of any head: our own where no public checkpoint has others."""
+        """Return the names of any head: our own if no public checkpoint has others."""
         head = HEADS.get(config.aggregator.part_name)
         if head is not None and head.kind is type(config.aggregator):
             return head
@@ -105,7 +105,7 @@ class _Reference(Format):
         return Format.infer(dataclasses.replace(self, head=head, projection=None), state)
 
     def has_head(self, state: State) -> bool:
-        """Return that it has any."""
+        """Return True: any head is accepted."""
         return True
 
 
@@ -114,16 +114,16 @@ TABLES: dict[str, Rows] = read_tables({}, {})
 _CHAINS: dict[str, PreprocessingConfig] = {}
 _BACKBONES: dict[str, BackboneNames] = {}
 HEADS: dict[str, Head] = {}
-"""Heads by name: the aggregator's, where it has names of its own in the reference."""
+"""Heads by name; the reference format uses a head that is named like its aggregator."""
 FORMATS: dict[str, Format] = {}
-"""Formats by name, in the order in which they try to detect a state."""
+"""Formats by name, in the order in which they are tried on a state."""
 
 
 def add_formats(facts: Mapping[str, Any], source: str) -> None:
     """Add the chains, tables, backbones, heads and formats of one file, or none of them.
 
     Raises:
-        InputError: naming `source`, if a name is there already, or what it says cannot be read.
+        InputError: naming `source`, if a name is taken, or the content cannot be read.
     """
     known = {"chains": _CHAINS, "tables": TABLES, "backbones": _BACKBONES, "heads": HEADS}
     known["formats"] = FORMATS
@@ -166,7 +166,7 @@ def _add(facts: Mapping[str, Any], source: str) -> None:
 
 
 def _backbone(text: str) -> BackboneNames:
-    """Return the names of one of some backbones, after a prefix."""
+    """Return the names for any of several backbones, after a prefix."""
     names, _, prefix = text.partition(" ")
     first, *others = (choose("backbone", name, _BACKBONES) for name in names.split(","))
     for other in others:

@@ -1,4 +1,4 @@
-"""A format of public checkpoints: what its files call a model's parts, and how it is inferred."""
+"""A format of public checkpoints: its names for a model's parts, and how to infer the model."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -19,7 +19,7 @@ class BackboneNames(NamedTuple):
     """How files name a backbone's parameters."""
 
     kinds: tuple[type[Backbone], ...]
-    """Classes of the backbones; empty for any, which is in another file."""
+    """Classes of the backbones; empty for any, from another file."""
     rows: Rows
     """Table of their names after the prefix, and ours after `backbone.`."""
     marks: tuple[str, ...]
@@ -34,13 +34,13 @@ class Head(NamedTuple):
     rows: Rows
     """Table of their names after the prefix, and ours after `aggregator.`."""
     sizes: Mapping[str, str]
-    """Where files show the fields of the configuration."""
+    """Where to find the fields of the configuration in files."""
     mark: str | None
     """A name that any file with such a head has; None if it has no parameters."""
     prefix: str
 
     def infer(self, state: State) -> Aggregator:
-        """Make the configuration from names and shapes."""
+        """Infer the configuration from names and shapes."""
         read = Reader(state, self.prefix)
         return self.kind(**{field: read.read(where) for field, where in self.sizes.items()})
 
@@ -67,24 +67,24 @@ class Format:
     adapter: str = "none"
     """Name of the adapter; "any" is any."""
     encoder: str = "none"
-    """Name of the cross-image encoder; "any", or "none,NAME", where the file tells whether there is
+    """Name of the cross-image encoder; "any", or "none,NAME" if the file shows whether there is
     one."""
     extras: Rows = ()
-    """What their files have and no descriptor needs."""
+    """Arrays that their files have and no descriptor needs."""
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    """Fields by part that no shape shows."""
+    """Fields that shapes do not show, by part."""
     adjust: Callable[[State, ModelConfig], ModelConfig] = lambda state, config: config
-    """Function that sets what else a state tells of its model."""
+    """Function that sets what else a state shows of its model."""
     inside: str = ""
     """Key of the file's dictionary that holds the state, a slash, and a prefix of all names, as
     torch's DataParallel adds it; empty: the file is the state."""
     stored: Literal["torch", "safetensors"] = "torch"
     """Kind of file."""
     bare: bool = False
-    """Whether a file is one tensor by itself, which is a part of a model."""
+    """Whether a file is a single tensor, which is a part of a model."""
 
     def parts(self) -> dict[str, list[str]]:
-        """Return what each part of a model may be; "any" is anything."""
+        """Return the allowed names of each part of a model; "any" allows all."""
         return {
             "aggregator": [self.head.kind.part_name],
             "backbone": [kind.part_name for kind in self.backbone.kinds] or ["any"],
@@ -97,7 +97,7 @@ class Format:
         """Check that a model has exactly the family's parts.
 
         Raises:
-            InputError: it has another.
+            InputError: one of its parts is another.
         """
         allowed = self.parts()
         for part, found in parts_of(config).items():
@@ -134,11 +134,11 @@ class Format:
         return any(self.backbone.prefix + mark in state for mark in self.backbone.marks)
 
     def has_head(self, state: State) -> bool:
-        """Return whether a state has the family's head; one without parameters is in any."""
+        """Return whether a state has the family's head; any state has one without parameters."""
         return self.head.mark is None or self.head.prefix + self.head.mark in state
 
     def infer(self, state: State) -> ModelConfig:
-        """Make the configuration of a state that has both, from names and shapes."""
+        """Infer the configuration of a state with backbone and head, from names and shapes."""
         backbone = self.backbone
         config = ModelConfig(
             image_size=self.image_size,
@@ -164,7 +164,7 @@ class Format:
 
 
 def parts_of(config: ModelConfig) -> dict[str, str]:
-    """Return what a model's parts are, as `Format.parts` names them."""
+    """Return the names of a model's parts, as in `Format.parts`."""
     backbone = config.backbone
     return {
         "aggregator": config.aggregator.part_name,

@@ -1,7 +1,7 @@
-"""Infer what a public checkpoint is, whatever training tools put around its names.
+"""Infer what a public checkpoint is, whatever wrappers training tools put around its names.
 
-torch.compile, DataParallel, FSDP and activation checkpointing wrap modules, each under a name of
-its own; Lightning has the network in a field `model`. The training of facebookresearch/dinov2 and
+torch.compile, DataParallel, FSDP and activation checkpointing wrap modules, each under its own
+name; Lightning has the network in a field `model`. The training code of facebookresearch/dinov2 and
 dinov3 saves its teacher with heads, or next to its student, and its blocks in chunks.
 """
 
@@ -17,7 +17,7 @@ from crisalad_jax.utils.output import warn
 
 _WRAPPERS = r"(?<![^.])(?:_orig_mod|module|_fsdp_wrapped_module|_checkpoint_wrapped_module)\."
 _CHUNKS = r"(?<![^.])(blocks\.)\d+\.(?=\d+\.)"
-"""Number of a chunk, before that of the block, which counts on from chunk to chunk."""
+"""Number of a chunk, before that of the block; blocks are numbered across chunks."""
 _HEADS = ("dino_head.", "ibot_head.")
 
 
@@ -29,15 +29,15 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
 def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
     """Infer the format and the configuration of a state, from its names and shapes.
 
-    Settings that no shape shows are the published ones: heads of width 64 in the backbone, 16 heads
-    in the encoder, alpha 0.2, three Sinkhorn iterations, the family's image size and resize. Names
-    of wrappers are taken away; a note says how much else is left out.
+    Settings that shapes do not show are the published ones: heads of width 64 in the backbone, 16
+    heads in the encoder, alpha 0.2, three Sinkhorn iterations, the family's image size and resize.
+    Names of wrappers are removed; a note says how many other tensors are left out.
 
     Returns:
         (format, configuration, the arrays by the format's own names).
 
     Raises:
-        InputError: naming `source`, if the names are of no format or the widths of no model.
+        InputError: naming `source`, if the names fit no format or the widths no model.
     """
     found: list[tuple[int, str, ModelConfig, str, State]] = []
     problems: list[str] = []
@@ -55,7 +55,7 @@ def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
         if any(unlike == 0 for unlike, *_ in found):
             break
     if found:
-        # Families share names: the one that holds most of them, and the first of equals.
+        # Families share names: take the one that fits most of them, the first among equals.
         _, name, config, prefix, inside = min(found, key=lambda each: each[0])
         if others := len(state) - len(inside):
             place = prefix.removesuffix(".")
@@ -72,16 +72,16 @@ def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
 
 
 def renamed_to(state: State, names: Set[str]) -> State:
-    """Return the reading of a state that has the most of these names, and no others."""
+    """Return the reading of a state whose names are closest to these."""
     return min((inside for _, inside in _readings(state)), key=lambda x: len(names ^ x.keys()))
 
 
 def _readings(state: State) -> Iterator[tuple[str, State]]:
-    """Yield a state as it is, without wrappers' names, and then what is under longer prefixes."""
+    """Yield a state as it is, then without wrapper names, then what is under longer prefixes."""
     yield "", state
     names = {name: re.sub(_CHUNKS, r"\1", re.sub(_WRAPPERS, "", name)) for name in state}
     if len(set(names.values())) < len(names):
-        return  # of two networks: no name may stand for two arrays
+        return  # two networks, of which one name would mean two arrays
     whole, inside = "", {names[name]: array for name, array in state.items()}
     if inside.keys() != state.keys():
         yield whole, inside
@@ -92,7 +92,7 @@ def _readings(state: State) -> Iterator[tuple[str, State]]:
 
 
 def _prefix(state: State) -> str | None:
-    """Return the prefix of what may be a model by itself inside a state."""
+    """Return the prefix of a part of a state that may be a complete model."""
     for prefix in ("model.", "teacher."):
         if any(name.startswith(prefix) for name in state):
             return prefix

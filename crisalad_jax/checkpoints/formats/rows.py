@@ -1,7 +1,7 @@
-"""Rows of tables: which arrays of a torch file are which of ours, and how their axes are permuted.
+"""Rows of tables: which arrays of a torch file match ours, and how their axes are permuted.
 
-Forms permute numbers alone. Gradients can therefore be converted like weights, and a round trip
-gives the same bits.
+Forms only permute values. Gradients can therefore be converted like weights, and a round trip gives
+the same bits.
 """
 
 import itertools
@@ -33,20 +33,20 @@ class Extra(NamedTuple):
     """An array of theirs that no model of ours uses, stored so that a round trip is exact."""
 
     initial: Callable[[Any], np.ndarray]
-    """Function of the model's configuration that makes it, where no such file was read."""
+    """Function of the model's configuration that makes it, if no such file was read."""
     form: Form = SAME
     optional: bool = False
-    """Whether files may be without it, so that it is written only where it was read."""
+    """Whether files may lack it, so that it is written only if it was read."""
 
 
 class Absent(NamedTuple):
-    """An array of ours that no output needs and their files leave out: filled when read."""
+    """An array of ours that no output needs and their files lack; it is filled when read."""
 
     value: float
 
 
 class Row(NamedTuple):
-    """Arrays that correspond, or layers whose arrays a table has. "#" is counted from 0."""
+    """Corresponding arrays, or layers whose arrays a table lists. "#" is counted from 0."""
 
     ours: tuple[str, ...]
     theirs: tuple[str, ...]
@@ -63,7 +63,7 @@ def side(area: int) -> int:
 
 
 def _mask_of(bias: np.ndarray) -> np.ndarray:
-    """Make `bias_mask`: 0 for keys, and for all where no bias is other than 0, as published."""
+    """Make `bias_mask`: 0 for keys, and for all if every bias is 0, as published."""
     mask = np.full_like(bias, float(bias.any()))
     mask[len(mask) // 3 : 2 * len(mask) // 3] = 0
     return mask
@@ -110,7 +110,7 @@ _LAYERS = {
     "linear": FORMS["transposed"],
     "pointwise": Form(lambda w: (w[:, :, 0, 0].T,), lambda w: (w.T[:, :, None, None],)),
     "conv": Form(lambda w: (w.transpose(2, 3, 1, 0),), lambda w: (w.transpose(3, 2, 0, 1),)),
-    # A transposed convolution, whose torch weight begins with the channels that come in.
+    # A transposed convolution, whose torch weight begins with the input channels.
     "upconv": Form(lambda w: (w.transpose(2, 3, 0, 1),), lambda w: (w.transpose(2, 3, 0, 1),)),
     "depthwise": Form(
         lambda w: (w[:, 0].transpose(1, 2, 0),), lambda w: (w.transpose(2, 0, 1)[:, None],)
@@ -119,14 +119,14 @@ _LAYERS = {
         lambda w: (w.transpose(2, 3, 1, 0).reshape(-1, w.shape[0]),),
         lambda w: (w.reshape(side(len(w) // 3), side(len(w) // 3), 3, -1).transpose(3, 2, 0, 1),),
     ),
-    # In hloc a descriptor has all clusters' first channel before whitening, then their second.
+    # Before whitening, hloc's descriptor has the first channel of all clusters, then the second.
     "hloc-whitening": Form(lambda w: (_by_cluster(w.T),), lambda w: (_by_channel(w).T,)),
 }
 """Forms of the weights of layers, which may have a bias, by the layer's name."""
 
 
 def _zeros(shape: Callable[[Any], tuple[int, ...]], form: Form = SAME) -> Extra:
-    """Return an array that is zero where no file was read, of a shape by the configuration."""
+    """Return an array of zeros for when no file was read; the configuration gives its shape."""
     return Extra(lambda config: np.zeros(shape(config), np.float32), form)
 
 
@@ -143,7 +143,7 @@ def _patch_numbers(config: Any) -> int:
 
 
 def _published_periods(config: Any) -> np.ndarray:
-    """Return a head's periods as DINOv3's public files have them, rounded to bfloat16."""
+    """Return a head's periods as DINOv3's public files store them, rounded to bfloat16."""
     periods = rotary_periods(config.backbone.dim // config.backbone.heads)
     return np.asarray(periods.astype(jnp.bfloat16), np.float32)
 
@@ -162,8 +162,8 @@ EXTRAS = {
     "extra-branch-1": _zeros(lambda config: (config.aggregator.hidden,)),
     "extra-branch-2": _zeros(lambda config: (192, config.aggregator.hidden, 1, 1)),
     "extra-branch-3": _zeros(lambda config: (192,)),
-    # What Pair-VPR's first stage of training predicts masked pixels by, and positions with a row
-    # for the class token, which its code makes of the others.
+    # What Pair-VPR's first training stage predicts masked pixels with, and positions with a row for
+    # the class token, which its code makes from the others.
     "extra-decoder-mask": _zeros(lambda config: (1, 1, config.aggregator.width)),
     "extra-decoder-positions": _zeros(
         lambda config: (1 + config.aggregator.positions, config.aggregator.width)
@@ -171,17 +171,17 @@ EXTRAS = {
     "extra-pixels-weight": _zeros(lambda config: (_patch_numbers(config), config.aggregator.width)),
     "extra-pixels-bias": _zeros(lambda config: (_patch_numbers(config),)),
 }
-"""What files have and no descriptor needs, by name."""
+"""Arrays that files have and no descriptor needs, by name."""
 ABSENT = {
     "absent-zero": Absent(0.0),
     "absent-one": Absent(1.0),
     "absent-exponent": Absent(START),
 }
-"""What files lack, by name."""
+"""Arrays that files lack, by name."""
 
 
 def read_tables(texts: Mapping[str, str], known: Mapping[str, Rows]) -> dict[str, Rows]:
-    """Read tables that have rows of one another, the later ones of the earlier ones."""
+    """Read tables, of which later ones may include rows of earlier ones."""
     bias = Row(("bias",), ("bias",), SAME)
     tables: dict[str, Rows] = {
         name: (Row(("weight",), ("weight",), form), bias) for name, form in _LAYERS.items()
@@ -216,15 +216,15 @@ def read_table(text: str, tables: Mapping[str, Rows]) -> Rows:
 
 
 def expand(rows: Rows, names: Iterable[str], ours: str = "", theirs: str = "") -> Iterator[Row]:
-    """Yield the rows of a model's arrays, and of the extra ones of its layers.
+    """Yield the rows of a model's arrays, and of the extra arrays of its layers.
 
-    Rows of what the model lacks are left out, and those with "#" are repeated for all that it has.
+    Rows of arrays that the model lacks are left out; those with "#" are repeated for all it has.
 
     Args:
         rows: the table.
         names: the model's arrays; blocks are numbered.
-        ours: what comes before all our names in the table.
-        theirs: what comes before all their names in it.
+        ours: prefix of all our names in the table.
+        theirs: prefix of all their names in it.
     """
     parts = (itertools.accumulate(name.split("."), "{}.{}".format) for name in names)
     return _expand(rows, set(itertools.chain.from_iterable(parts)), ours, theirs)
@@ -244,7 +244,7 @@ def _expand(rows: Rows, known: set[str], ours: str, theirs: str) -> Iterator[Row
 
 
 def first_names(rows: Rows, ours: str = "", theirs: str = "") -> dict[str, str]:
-    """Return their names by ours, of the first of several; "#" is 0."""
+    """Map our names to theirs, taking the first of several; "#" is 0."""
     named: dict[str, str] = {}
     for row in rows:
         here, there = (

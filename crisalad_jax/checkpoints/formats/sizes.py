@@ -1,4 +1,4 @@
-"""Make configurations from the names and shapes of a public checkpoint."""
+"""Infer configurations from the names and shapes of a public checkpoint."""
 
 import dataclasses
 import math
@@ -27,12 +27,12 @@ from crisalad_jax.utils.errors import InputError
 _V = TypeVar("_V", bound=VisionTransformer)
 State = Mapping[str, np.ndarray]
 _HEAD_WIDTH = 64
-"""Width of an attention head in every DINOv2, and in TransVPR; no shape shows their number."""
+"""Width of an attention head in every DINOv2, and in TransVPR; shapes do not show their number."""
 _SIDE_ALPHA = 0.5
-"""Weight of EDTformer's adapters, which no shape shows."""
+"""Weight of EDTformer's adapters, which shapes do not show."""
 _PERIODS = "rope_embed.periods"
 _ENCODER_HEADS = 16
-"""Number of heads of the published cross-image encoder, which no shape shows."""
+"""Number of heads of the published cross-image encoder, which shapes do not show."""
 
 
 class Reader(NamedTuple):
@@ -68,7 +68,7 @@ class Reader(NamedTuple):
         return next(i for i in range(len(heads) + 1) if f"{self.prefix}{name}{i}" not in heads)
 
     def read(self, where: str) -> int:
-        """Return the size that a table of sizes says where to find: see formats.toml."""
+        """Return the size at the place that a table of sizes gives; see formats.toml."""
         name, _, axis = where.partition(" ")
         if not axis:
             return self.count(name.removesuffix("#"))
@@ -76,7 +76,7 @@ class Reader(NamedTuple):
 
 
 def infer_backbone(kinds: tuple[type[Any], ...], rows: Rows, read: Reader) -> Backbone:
-    """Make the configuration of a backbone, one of `kinds`, from names and shapes.
+    """Infer the configuration of a backbone, one of `kinds`, from names and shapes.
 
     Raises:
         InputError: it has sizes that no configuration has.
@@ -114,7 +114,7 @@ def _infer_vit(kind: type[_V], theirs: dict[str, str], read: Reader) -> _V:
         adapter=_infer_adapter(read, dim),
         **fields,
     )
-    # Of SwiGLU's two thirds, the ratio is 4 where they are DINOv2's.
+    # SwiGLU's width is two thirds of the ratio's: try DINOv2's ratio of 4 first.
     for ratio in (4.0, 1.5 * hidden / dim) if gated else (hidden / dim,):
         found = dataclasses.replace(config, mlp_ratio=ratio)
         if found.hidden == hidden:
@@ -123,10 +123,10 @@ def _infer_vit(kind: type[_V], theirs: dict[str, str], read: Reader) -> _V:
 
 
 def _check_periods(read: Reader) -> int:
-    """Return the width of a head, whose periods are to be DINOv3's."""
+    """Return the width of a head, and check that its periods are DINOv3's."""
     head_dim = 4 * read.size(_PERIODS, 0)
     expected, found = rotary_periods(head_dim), read.state[read.prefix + _PERIODS]
-    # Half a step of bfloat16, in which the public files have them.
+    # Half a step of bfloat16, in which the public files store them.
     if not np.allclose(found, expected, rtol=2.0**-8, atol=0):
         raise InputError(f"{_PERIODS} found {found.tolist()}, expected about {expected.tolist()}")
     return head_dim
@@ -136,7 +136,7 @@ def square_side(area: int, otherwise: str) -> int:
     """Return the side of a square grid.
 
     Raises:
-        InputError: the area is no square; the message is `otherwise`.
+        InputError: the area is not a square number; the message is `otherwise`.
     """
     length = math.isqrt(area)
     if length**2 != area or not length:
@@ -145,7 +145,7 @@ def square_side(area: int, otherwise: str) -> int:
 
 
 def _infer_adapter(read: Reader, width: int) -> Adapter:
-    """Infer which adapters there are, and their sizes; how much they weigh is as published."""
+    """Infer the adapters and their sizes; their weight (alpha) is the published one."""
     if count := read.count("gpn_norms."):
         hidden = read.size("gpn_norms.0.projection.0.weight", 0)
         return ADAPTERS.make("dynamic-power", last=count, hidden=hidden)

@@ -53,11 +53,11 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
         The configuration that is inferred from its file, which may have other free fields.
 
     Raises:
-        InputError: what `table` raises; or a setting that no shape tells and that differs from the
-            published one, which reading would take for it.
+        InputError: what `table` raises; or a setting that shapes do not show differs from the
+            published one, which reading would return instead.
     """
     state = _blank_state(config, name)
-    if name in (REFERENCE, VOCABULARY):  # which have the configuration, or no model
+    if name in (REFERENCE, VOCABULARY):  # contain their configuration, or no model
         return config
     read_back = FORMATS[name].infer(state)
     wrong = differences(_shown(with_non_semantic_fields_of(config, read_back)), _shown(config))
@@ -138,7 +138,7 @@ def to_params(
 def to_state(
     params: Crisalad, config: ModelConfig, name: str, extras: State
 ) -> dict[str, np.ndarray]:
-    """Undo `to_params`, in the public order; missing extras have their initial values.
+    """Invert `to_params`, in the public order; missing extras have their initial values.
 
     Raises:
         InputError: the format has no place for a part of this model.
@@ -151,7 +151,7 @@ def to_state(
 def _theirs(
     leaves: State, lines: list[Row], config: ModelConfig, extras: State | None
 ) -> dict[str, np.ndarray]:
-    """Return their arrays; without extras, all that a file may have, with their initial values."""
+    """Return their arrays; if `extras` is None, all that a file may have, with initial values."""
     ours, state = _numbered(leaves), {}
     for row in lines:
         if isinstance(row.form, Form):
@@ -166,7 +166,7 @@ def _theirs(
 
 
 _STACK = re.compile(r"backbone\.blocks\.(?!\d)")
-"""Beginning of the names of stacked blocks; blocks that are no stack have numbers already."""
+"""Prefix of the names of stacked blocks; blocks that are not stacked have numbers already."""
 
 
 def _numbered(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -182,7 +182,7 @@ def _numbered(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _from_numbered(ours: State, config: ModelConfig) -> Crisalad:
-    """Undo `_numbered`; empty arrays, such as absent registers, have no line in any table."""
+    """Invert `_numbered`; empty arrays, such as absent registers, have no line in any table."""
     template = parameter_shapes(config)
     leaves = []
     for name, leaf in named_leaves(template).items():

@@ -1,5 +1,5 @@
-"""Convert traced programs to ONNX: one small function for each primitive of JAX.
+"""Convert traced programs to ONNX, with one small function for each JAX primitive.
 
-`convert` walks through a program, `graph` holds the nodes, and the other modules are the functions.
-What has constant inputs is computed at once, so that loops over layers become plain nodes.
+`convert` walks through a program, `graph` holds the nodes, and `operators` has the functions.
+Operations with constant inputs are folded, so that loops over layers become plain nodes.
 """

@@ -11,19 +11,19 @@ from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known
 from crisalad_jax.checkpoints.onnx_format.operators import CONVERTERS, Unsupported, stacked
 
 _CALLED = ("jaxpr", "call_jaxpr")
-"""Parameters of primitives that call a program once: `jax.jit`, rematerialisation, own gradients"""
+"""Parameters of primitives that call a program once: `jax.jit`, remat, custom gradients."""
 
 
 def convert(graph: Graph, traced: Any, inputs: Sequence[Value]) -> list[Value]:
     """Append the nodes of a program.
 
     Args:
-        graph: takes them.
+        graph: the graph to append to.
         traced: the program, of `jax.make_jaxpr`.
         inputs: its arguments, constants or not.
 
     Returns:
-        The outputs. Those that an unknown primitive is part of say so in `Value.missing`.
+        The outputs. Those that depend on an unsupported primitive name it in `Value.missing`.
     """
     return _run(graph, traced.jaxpr, [Value.of(each) for each in traced.consts], inputs)
 
@@ -46,7 +46,7 @@ def _run(
 
 
 def _equation(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
-    """Convert an equation. What it lacks is remembered, and raised only if it turns out needed."""
+    """Convert an equation; an unsupported one is recorded, and raised only if it is needed."""
     name = eqn.primitive.name
     called = next((eqn.params[key] for key in _CALLED if key in eqn.params), None)
     try:
@@ -65,17 +65,17 @@ def _equation(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
             return [_nothing(var.aval) for var in eqn.outvars]
         return CONVERTERS.get(name, _folded)(graph, inputs, eqn)
     except Unsupported as error:
-        nothing = np.dtype(np.float32)  # of types of JAX's own, such as a key's, there is no other
+        nothing = np.dtype(np.float32)  # JAX's own types, such as a key's, have no other
         return [Value(var.aval.shape, nothing, missing=str(error)) for var in eqn.outvars]
 
 
 def _nothing(aval: Any) -> Value:
-    """Return an array without numbers, of which engines cannot tell the symbolic side."""
+    """Return an empty array, whose symbolic side engines cannot infer."""
     return Value.of(np.zeros([s if is_known(s) else 1 for s in aval.shape], aval.dtype))
 
 
 def _folded(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    """Compute what has constant inputs, by any primitive."""
+    """Compute any primitive that has constant inputs."""
     arrays = [value.constant for value in inputs]
     wholes = [var.aval.shape for var in eqn.invars]
     known = all(is_known(size) for shape in wholes for size in shape)
@@ -88,11 +88,11 @@ def _folded(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 
 
 def _unrolled(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
-    """Convert a loop of so many turns, turn by turn: its slices of weights are then constants."""
+    """Unroll a loop of known length, so that its slices of weights are constants."""
     params, length = eqn.params, eqn.params["length"]
     body = params["jaxpr"]
-    # By ranks, because the parameters that count them differ between versions of JAX: what a turn
-    # passes on comes first, and what it stacks has a side less inside.
+    # Count by ranks, because the parameters with the counts differ between versions of JAX: carried
+    # values come first, and stacked ones have one axis less inside the loop.
     count = sum(map(operator.eq, _ranks(eqn.outvars), _ranks(body.jaxpr.outvars)))
     stacked = sum(map(operator.gt, _ranks(eqn.invars), _ranks(body.jaxpr.invars)))
     first = len(inputs) - stacked

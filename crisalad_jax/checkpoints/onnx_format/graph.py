@@ -1,4 +1,4 @@
-"""The nodes of an ONNX graph as they are made, and the values that run between them."""
+"""The nodes of an ONNX graph under construction, and the values that pass between them."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from onnx import helper
 from crisalad_jax.utils.version import VERSION
 
 OPSET = 17
-"""Version of the operators: all engines of the last years take it, TensorRT since 8.5."""
+"""Version of the operators: all recent engines support it, TensorRT since 8.5."""
 _IR_VERSION = 8
 """Version of the file format that came with these operators."""
 Size = Any
@@ -25,7 +25,7 @@ def is_known(size: Size) -> bool:
 
 
 def is_one(size: Size) -> bool:
-    """Return whether a side is 1, as of what a node broadcasts by itself."""
+    """Return whether a side is 1, which a node broadcasts by itself."""
     return is_known(size) and size == 1
 
 
@@ -45,8 +45,8 @@ def _with_side(shape: Shape, axis: int, size: Size) -> Shape:
 class Value:
     """A constant, or an output of a node.
 
-    It is broadcast lazily: sides of `shape` are 1 where those of the array in JAX's program are
-    more, and all rows along them alike.
+    It is broadcast lazily: a side of `shape` may be 1 where the array in JAX's program has a larger
+    one, along which all its rows are the same.
     """
 
     shape: Shape
@@ -54,7 +54,7 @@ class Value:
     name: str = ""
     constant: np.ndarray | None = None
     missing: str = ""
-    """What could not be converted, of which this would be the result; empty where it is there."""
+    """The unsupported operation whose result this would be; empty for a value that exists."""
 
     @classmethod
     def of(cls, array: Any) -> "Value":
@@ -67,15 +67,15 @@ class Graph:
     """The nodes so far."""
 
     def __init__(self) -> None:
-        """Start with none."""
+        """Start without nodes."""
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[str, np.ndarray] = {}
         self.symbolic: dict[Any, str] = {}
-        """Names of int64 vectors of one number by the symbolic sides that they hold."""
+        """Names of int64 vectors of one element, by the symbolic sides that they hold."""
         self._names: dict[Any, str] = {}
 
     def constant(self, array: np.ndarray) -> str:
-        """Return the name of a constant; small ones that are alike share it."""
+        """Return the name of a constant; small ones that are equal share it."""
         small = array.nbytes <= 1024
         key = (str(array.dtype), array.shape, array.tobytes()) if small else id(array)
         if key not in self._names:
@@ -84,7 +84,7 @@ class Graph:
         return self._names[key]
 
     def name(self, value: Value) -> str:
-        """Return the name of a value, which becomes a constant of the graph where it is one."""
+        """Return the name of a value; a constant is added to the graph."""
         return value.name if value.constant is None else self.constant(value.constant)
 
     def ints(self, *numbers: int) -> str:
@@ -105,23 +105,23 @@ class Graph:
         return Value(tuple(shape), np.dtype(dtype), self.node(operator, names, **fields))
 
     def side(self, size: Size) -> str:
-        """Return the name of a vector of one int64: a side's number, computed where symbolic."""
+        """Return the name of an int64 vector of one side's size, computed if it is symbolic."""
         if is_known(size):
             return self.ints(int(size))
-        if size not in self.symbolic:  # a multiple of one that is there
+        if size not in self.symbolic:  # a multiple of one that exists
             unit = next(unit for unit in self.symbolic if size // unit * unit == size)
             factor = self.side(size // unit)
             self.symbolic[size] = self.node("Mul", [self.symbolic[unit], factor])
         return self.symbolic[size]
 
     def sides(self, shape: Shape) -> str:
-        """Return the name of an int64 vector of a shape's numbers."""
+        """Return the name of an int64 vector of a shape's sizes."""
         if all(map(is_known, shape)):
             return self.ints(*map(int, shape))
         return self.node("Concat", [self.side(size) for size in shape], axis=0)
 
     def full(self, value: Value, shape: Shape, axes: Sequence[int] | None = None) -> Value:
-        """Broadcast a value to the whole shape of its array, or along some axes."""
+        """Broadcast a value to the full shape of its array, or along some axes."""
         axes = range(len(shape)) if axes is None else axes
         wanted = tuple(
             size if axis in axes else own
@@ -131,7 +131,7 @@ class Graph:
             return value
         if value.constant is not None and all(map(is_known, wanted)):
             return Value.of(np.broadcast_to(value.constant, wanted))
-        # A side of 1 keeps what is there: only those that grow need a number while it runs.
+        # A side of 1 in Expand changes nothing: only sides that grow need their size at run time.
         grown = [s if is_one(o) else 1 for o, s in zip(value.shape, wanted, strict=True)]
         return self.add("Expand", [value, self.sides(tuple(grown))], wanted, value.dtype)
 
@@ -165,7 +165,7 @@ class Graph:
         return self.add("Cast", [value], value.shape, dtype, to=tensor_type(dtype))
 
     def slice(self, value: Value, ranges: Mapping[int, tuple[int, int, int]]) -> Value:
-        """Take some of each axis: start, end and step by axis."""
+        """Slice some axes: start, end and step by axis."""
         ranges = {axis: cut for axis, cut in ranges.items() if cut != (0, value.shape[axis], 1)}
         if not ranges:
             return value
@@ -180,7 +180,7 @@ class Graph:
         return self.add("Slice", [value, *vectors], tuple(shape), value.dtype)
 
     def concatenate(self, values: Sequence[Value], axis: int) -> Value:
-        """Join values, which are of one shape but for the axis, and whole along it."""
+        """Join values whose shapes differ only along the axis, where none is broadcast lazily."""
         values = [value for value in values if value.shape[axis] != 0] or values[:1]
         shape = common_shape(*(_with_side(v.shape, axis, 1) for v in values))
         parts = [self.full(v, _with_side(shape, axis, v.shape[axis])) for v in values]
@@ -192,9 +192,9 @@ class Graph:
     def model(
         self, inputs: Sequence[Value], outputs: Sequence[tuple[str, Value]], words: str
     ) -> onnx.ModelProto:
-        """Return the program of what the outputs need.
+        """Return the program, with only the nodes that the outputs need.
 
-        The arrays of constants are left out: `write_onnx` puts them beside it or into it.
+        The arrays of constants are left out: `write_onnx` stores them in it or next to it.
         """
         for name, value in outputs:
             self.nodes.append(helper.make_node("Identity", [self.name(value)], [name]))
@@ -222,7 +222,7 @@ class Graph:
 
 
 def tensor_type(dtype: Any) -> int:
-    """Return ONNX's number of a type."""
+    """Return ONNX's number for a type."""
     return helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
 
 

@@ -1,4 +1,4 @@
-"""The conversion of each of JAX's primitives to nodes of ONNX."""
+"""The conversion of each JAX primitive to ONNX nodes."""
 
 import dataclasses
 import functools
@@ -19,13 +19,13 @@ from crisalad_jax.checkpoints.onnx_format.graph import (
 )
 
 Converter = Callable[[Graph, Sequence[Value], Any], list[Value]]
-"""A function that appends the nodes of JAX's equation to a graph, and returns the outputs."""
+"""A function that appends the nodes of a JAX equation to a graph, and returns the outputs."""
 CONVERTERS: dict[str, Converter] = {}
 """Converters by primitive."""
 
 
 class Unsupported(Exception):
-    """A primitive, or a use of one, that has no operator; the message names it."""
+    """A primitive, or a use of one, that cannot be converted; the message names it."""
 
 
 def converts(*names: str) -> Callable[[Converter], Converter]:
@@ -38,13 +38,13 @@ def converts(*names: str) -> Callable[[Converter], Converter]:
     return register
 
 
-# Number by number, which nodes broadcast as numpy does.
+# Elementwise operations, which nodes broadcast as numpy does.
 
 _SAME_NAMES = (
     *("abs", "add", "and", "ceil", "cos", "div", "erf", "exp", "floor", "log", "max", "min"),
     *("mul", "neg", "not", "or", "pow", "sign", "sin", "sqrt", "sub", "tanh", "xor"),
 )
-"""Primitives that have the operators' names, but for the capital letter."""
+"""Primitives that have the operators' names, except for the capital letter."""
 _PLAIN = {name: name.capitalize() for name in _SAME_NAMES} | {
     "add_any": "Add",
     "eq": "Equal",
@@ -54,7 +54,7 @@ _PLAIN = {name: name.capitalize() for name in _SAME_NAMES} | {
     "logistic": "Sigmoid",
     "lt": "Less",
 }
-"""Operators by the primitives that they are the same as."""
+"""Operators by the equivalent primitive."""
 _COMPOSED: Mapping[str, Callable[..., Value]] = {
     "clamp": lambda add, params, least, x, most: add("Min", add("Max", x, least), most),
     "exp2": lambda add, params, x: add("Pow", 2, x),
@@ -62,11 +62,11 @@ _COMPOSED: Mapping[str, Callable[..., Value]] = {
     "integer_pow": lambda add, params, x: (
         add("Mul", x, x) if params["y"] == 2 else add("Pow", x, params["y"])
     ),
-    # Only finite numbers are 0 times themselves; and no engine lacks these two.
+    # Only finite numbers times 0 are 0, and all engines have these two operators.
     "is_finite": lambda add, params, x: add("Equal", add("Mul", x, 0), 0),
     "log1p": lambda add, params, x: add("Log", add("Add", x, 1)),
     "ne": lambda add, params, x, y: add("Not", add("Equal", x, y)),
-    # `Round` takes halves to the even number, as jnp.round does; lax.round goes away from 0.
+    # `Round` rounds halves to even, as jnp.round does; lax.round rounds them away from 0.
     "round": lambda add, params, x: (
         add("Round", x)
         if params["rounding_method"].name == "TO_NEAREST_EVEN"
@@ -76,12 +76,12 @@ _COMPOSED: Mapping[str, Callable[..., Value]] = {
     "select_n": lambda add, params, which, no, yes: add("Where", which, yes, no),
     "square": lambda add, params, x: add("Mul", x, x),
 }
-"""Functions by primitive that make it of several operators."""
+"""Functions that build a primitive from several operators, by primitive."""
 
 
 @converts(*_PLAIN, *_COMPOSED)
 def _elementwise(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    """Convert to one operator or several. Constants are computed by JAX itself."""
+    """Convert to one operator or several. JAX itself computes constants."""
     name, dtype = eqn.primitive.name, np.dtype(eqn.outvars[0].aval.dtype)
     shape = common_shape(*(value.shape for value in inputs))
     if all(value.constant is not None for value in inputs):
@@ -98,16 +98,16 @@ def _elementwise(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]
 
 
 def _node(graph: Graph, shape: Shape, operator: str, *inputs: Value | float) -> Value:
-    """Append a node; numbers among the inputs are of the other inputs' type.
+    """Append a node; plain numbers among the inputs get the type of the other inputs.
 
-    Its own type may be another: that of the last node of an equation is set by the caller.
+    The type of the result may differ: the caller sets that of an equation's last node.
     """
     dtype = next(each.dtype for each in reversed(inputs) if isinstance(each, Value))
     values = [x if isinstance(x, Value) else Value.of(np.array(x, dtype)) for x in inputs]
     return graph.add(operator, values, shape, dtype)
 
 
-# Moving numbers, and computing none.
+# Operations that move values and compute none.
 
 
 @converts("stop_gradient", "name", "copy", "copy_p", "optimization_barrier", "reduce_precision")
@@ -137,7 +137,7 @@ def _reshape(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 
 
 def _with_other_ones(own: Shape, before: Shape, after: Shape) -> Shape | None:
-    """Return the lazy shape of an array that gains or loses sides of 1 alone; else None."""
+    """Return the lazy shape of an array that only gains or loses sides of 1; else None."""
     kept = [axis for axis, size in enumerate(before) if not is_one(size)]
     places = [axis for axis, size in enumerate(after) if not is_one(size)]
     if [before[axis] for axis in kept] != [after[axis] for axis in places]:
@@ -232,7 +232,7 @@ def _iota(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 
 @converts("gather")
 def _gather(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    """Convert a gather of one slice at a known place, as an index of `x[:, 0]` makes it."""
+    """Convert a gather of one slice at a known place, as in `x[:, 0]`."""
     x, places = inputs
     whole, shape = eqn.invars[0].aval.shape, eqn.invars[1].aval.shape
     how, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
@@ -249,7 +249,7 @@ def _gather(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     return [graph.reshape(part, tuple(part.shape[axis] for axis in kept))]
 
 
-# Reductions of axes, and of windows of images.
+# Reductions over axes, and over windows of images.
 
 
 _REDUCTIONS = {
@@ -265,13 +265,13 @@ _REDUCTIONS = {
 @converts(*_REDUCTIONS)
 def _reduce(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (x,), axes = inputs, eqn.params["axes"]
-    if x.dtype == np.bool_:  # repeated rows have their own extremes
-        x = graph.cast(x, np.float32)  # which TensorRT takes, unlike whole numbers
+    if x.dtype == np.bool_:  # repeating rows does not change extremes
+        x = graph.cast(x, np.float32)  # which TensorRT accepts, unlike integers
     else:
         x = graph.full(x, eqn.invars[0].aval.shape, axes)
     name = _REDUCTIONS[eqn.primitive.name]
     shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
-    # The sum alone has its axes as an input, since version 13.
+    # Only the sum takes its axes as an input, since version 13.
     is_sum = name == "ReduceSum"
     given, fields = ([x, graph.ints(*axes)], {}) if is_sum else ([x], {"axes": list(axes)})
     reduced = graph.add(name, given, shape, x.dtype, keepdims=0, **fields)
@@ -311,7 +311,7 @@ def _largest_of_windows(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list
     return [graph.transpose(pooled, np.argsort(order).tolist())]
 
 
-# Products of matrices, and convolutions.
+# Matrix products, and convolutions.
 
 
 @converts("dot_general")
@@ -320,7 +320,7 @@ def _product(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (shape_a, shape_b), dtype = (var.aval.shape for var in eqn.invars), eqn.outvars[0].aval.dtype
     free_a = [axis for axis in range(len(shape_a)) if axis not in (*summed_a, *batch_a)]
     free_b = [axis for axis in range(len(shape_b)) if axis not in (*summed_b, *batch_b)]
-    # MatMul broadcasts the batch; all other axes are needed as they are.
+    # MatMul broadcasts the batch; all other axes are needed in full.
     a = graph.cast(graph.full(inputs[0], shape_a, [*free_a, *summed_a]), dtype)
     b = graph.cast(graph.full(inputs[1], shape_b, [*free_b, *summed_b]), dtype)
     a = graph.transpose(a, [*batch_a, *free_a, *summed_a])
@@ -329,7 +329,7 @@ def _product(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     rows, columns = [shape_a[axis] for axis in free_a], [shape_b[axis] for axis in free_b]
     sums = [shape_a[axis] for axis in summed_a]
     a_batch, b_batch = a.shape[:count], b.shape[:count]
-    # Rows in several axes stay so where one matrix is common to all of them.
+    # Rows over several axes are not flattened if they all share one matrix.
     if count or len(columns) != 1 or not rows:
         a = graph.reshape(a, (*a_batch, math.prod(rows), math.prod(sums)))
     elif len(sums) != 1:

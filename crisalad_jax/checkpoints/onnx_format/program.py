@@ -17,7 +17,7 @@ from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known
 from crisalad_jax.utils.files import wrap_os_errors
 
 _PAGE = 4096
-"""Bytes that arrays next to a program begin at multiples of, so that they can be mapped."""
+"""Alignment in bytes of the arrays next to a program, so that they can be memory-mapped."""
 
 
 def write_onnx(
@@ -36,20 +36,20 @@ def write_onnx(
 
     Args:
         path: the file.
-        run: the function, of a dictionary of arrays and the inputs in their order.
+        run: the function, of a dictionary of arrays and the inputs in order.
         weights: the arrays.
         inputs: shapes and types of the inputs by name. Their first sides are the number of images,
             which may be symbolic.
         output: name of the output.
-        words: what the file says of itself.
-        beside: whether large weights go to a file of its own, `path` with .data appended.
+        words: description to store in the file.
+        beside: whether large weights go to a separate file, `path` with .data appended.
 
     Returns:
         Names of the nodes that multiply by weights.
 
     Raises:
-        InputError: the function has an operation that no operator of ONNX is made of; named. Or
-            the disk is full.
+        InputError: the function has an operation that cannot be converted, which the message names;
+            or the disk is full.
     """
     traced: Any = jax.make_jaxpr(run)(weights, *inputs.values())
     graph = Graph()
@@ -68,7 +68,7 @@ def write_onnx(
     model = graph.model(values, [(output, result)], words)
     end = 0
     for name, array in graph.constants.items():
-        # A view of transposed numbers is written in the order of its axes.
+        # A transposed view is written in the order of its axes.
         tensor = numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name)
         if beside and array.nbytes >= _PAGE:
             external_data_helper.set_external_data(tensor, f"{path.name}.data", offset=end)
@@ -76,7 +76,7 @@ def write_onnx(
         model.graph.initializer.append(tensor)
     products = _products(model, graph.constants, [np.asarray(each) for each in weights.values()])
     with wrap_os_errors(path):
-        if beside:  # however small its arrays are
+        if beside:  # even if all arrays are small
             path.with_name(f"{path.name}.data").touch()
         onnx.save_model(model, path)
     return products
@@ -85,7 +85,7 @@ def write_onnx(
 def _products(
     model: onnx.ModelProto, constants: Mapping[str, np.ndarray], weights: Sequence[np.ndarray]
 ) -> list[str]:
-    """Name the products whose second factor is a part of a weight, and not computed or made."""
+    """List the products whose second factor is part of a weight, not a computed array."""
     return [
         node.name
         for node in model.graph.node

@@ -1,4 +1,4 @@
-"""Quantise a program's products with weights to int8, by onnxruntime's own calibration."""
+"""Quantise a program's products with weights to int8, with onnxruntime's calibration."""
 
 import logging
 import pathlib
@@ -12,7 +12,7 @@ _OPERATORS = ["MatMul", "Conv"]
 
 
 class _Images(quantization.CalibrationDataReader):
-    """Images one by one, for the ranges of what layers give."""
+    """Images one by one, to measure the ranges of activations."""
 
     def __init__(self, images: np.ndarray) -> None:
         self._images = ({"images": image[None]} for image in images)
@@ -24,21 +24,21 @@ class _Images(quantization.CalibrationDataReader):
 def quantise(
     program: pathlib.Path, images: np.ndarray, nodes: Sequence[str], *, per_channel: bool
 ) -> None:
-    """Quantise a program of images in its place.
+    """Quantise a program of images in place.
 
     Args:
-        program: the file in float32, for any number of images; its weights lie beside it, with
+        program: the file in float32, for any number of images; its weights are next to it, with
             .data appended.
         images: prepared images of the kind that will be described.
         nodes: names of the products to quantise.
-        per_channel: whether each column of weights has a scale of its own, which is more exact.
+        per_channel: whether each column of weights has its own scale, which is more accurate.
     """
-    # It finds its weights by their name, so they keep it.
+    # It finds its weights by file name, so the names stay the same.
     whole = program.parent / "float32"
     whole.mkdir()
     for each in (program, program.with_name(f"{program.name}.data")):
         each.rename(whole / each.name)
-    # Leave out the advice to optimise the program first, which was done as it was made.
+    # Hide the advice to optimise the program first, which was done when it was made.
     logging.disable(logging.WARNING)
     try:
         quantization.quantize_static(
@@ -54,7 +54,7 @@ def quantise(
             use_external_data_format=True,
             extra_options={
                 "MatMulConstBOnly": True,
-                # Sums of products are wider than int8, and OpenVINO fails to reshape them in it.
+                # Sums of products are wider than int8, and OpenVINO cannot reshape them in int8.
                 "OpTypesToExcludeOutputQuantization": _OPERATORS,
             },
         )

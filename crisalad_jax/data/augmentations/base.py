@@ -1,4 +1,4 @@
-"""Augmentations: random changes of training images, and the interface of a new one."""
+"""Augmentations: random changes of training images, and the interface for custom ones."""
 
 import abc
 
@@ -33,8 +33,8 @@ class Augmentation(Part, abc.ABC):
 
         Args:
             image: 8-bit RGB, of the model's size. Do not write to it; it may be returned.
-            generator: draws for this image alone.
-            of_place: draws the same for all images of one place in a batch.
+            generator: random numbers for this image only.
+            of_place: random numbers that all images of one place in a batch share.
         """
 
 

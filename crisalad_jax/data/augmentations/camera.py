@@ -1,4 +1,4 @@
-"""What cameras do to a picture: another stand, motion, few pixels, a smudge, noise, JPEG."""
+"""Camera effects: viewpoint, motion blur, occlusion, low resolution, noise and JPEG."""
 
 import math
 
@@ -10,22 +10,22 @@ from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 
 _QUALITY = (12, 85)
-"""Least and most quality of a JPEG."""
+"""Lowest and highest JPEG quality."""
 
 
 @AUGMENTATIONS.register("camera")
 class CameraAugmentConfig(LightAugmentConfig):
-    """The light augmentation, and then a cheap camera: for rendered pictures, which lack one."""
+    """The light augmentation, then the effects of a cheap camera, which rendered images lack."""
 
     perspective: Fraction = 0.04
     """Largest shift of a corner, as a share of the side."""
     texture: NonNegativeFloat = 0.25
-    """Largest deviation of a multiplied texture of several scales, which rendered walls lack."""
+    """Largest deviation of a multiplicative multi-scale texture, which rendered walls lack."""
     filters: Share = 0.3
-    """Probability of random filters over all colours, which change textures and keep outlines (Xu
+    """Probability of random filters over all colours, which change textures but not outlines (Xu
     et al., ICLR 2021)."""
     occlusion: Share = 0.3
-    """Probability that something covers a part."""
+    """Probability that a part is covered."""
     motion: Share = 0.2
     """Probability of motion blur, of up to a sixteenth of the width."""
     coarse: Share = 0.3
@@ -33,12 +33,12 @@ class CameraAugmentConfig(LightAugmentConfig):
     noise: NonNegativeFloat = 8.0
     """Largest deviation of noise, in grey levels."""
     jpeg: Share = 0.4
-    """Probability of another JPEG."""
+    """Probability of JPEG coding."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Mirror all images of a place alike, change this one's light, then photograph it."""
+        """Mirror all images of a place together, change this one's light, add camera effects."""
         if self.flip > 0 and of_place.random() < self.flip:
             image = cv2.flip(image, 1)
         if self.perspective > 0:
@@ -64,7 +64,7 @@ class CameraAugmentConfig(LightAugmentConfig):
 
 
 def _moved(image: Image, most: float, generator: np.random.Generator) -> Image:
-    """Move the corners a little, as another stand does."""
+    """Shift the corners a little, like a change of viewpoint."""
     height, width = image.shape[:2]
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     shifts = generator.uniform(-most, most, (4, 2)) * (width, height)
@@ -87,7 +87,7 @@ def _textured(image: Image, deviation: float, generator: np.random.Generator) ->
 
 
 def _filtered(image: Image, generator: np.random.Generator) -> Image:
-    """Mix the image with that of random filters, whose mean and deviation are the image's."""
+    """Blend the image with a randomly filtered copy of the same mean and deviation."""
     side = int(generator.choice((1, 3, 5)))
     weights = generator.standard_normal((3, 3, side, side), np.float32)
     pixels = image.astype(np.float32)
@@ -101,7 +101,7 @@ def _filtered(image: Image, generator: np.random.Generator) -> Image:
 
 
 def _covered(image: Image, generator: np.random.Generator) -> Image:
-    """Cover a rectangle or an ellipse by one colour."""
+    """Cover a rectangle or an ellipse with one colour."""
     image = image.copy()
     height, width = image.shape[:2]
     size = (generator.uniform(0.05, 0.4, 2) * (width, height)).astype(int)
@@ -116,7 +116,7 @@ def _covered(image: Image, generator: np.random.Generator) -> Image:
 
 
 def _smeared(image: Image, generator: np.random.Generator) -> Image:
-    """Blur along a line, mostly a level one."""
+    """Blur along a line, usually a nearly horizontal one."""
     length = int(generator.integers(2, max(3, image.shape[1] // 16 + 1)))
     angle = generator.normal(0, 0.4)
     kernel = np.zeros((2 * length + 1, 2 * length + 1), np.float32)
@@ -127,7 +127,7 @@ def _smeared(image: Image, generator: np.random.Generator) -> Image:
 
 
 def _coarsened(image: Image, generator: np.random.Generator) -> Image:
-    """Take fewer pixels, and enlarge them again."""
+    """Shrink the image, and enlarge it again."""
     height, width = image.shape[:2]
     share = generator.uniform(0.4, 0.9)
     size = (max(2, round(share * width)), max(2, round(share * height)))

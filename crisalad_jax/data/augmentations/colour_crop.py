@@ -1,4 +1,4 @@
-"""CosPlace's and EigenPlaces' augmentation: changes of colour, then a crop (Berton et al. 2022).
+"""CosPlace's and EigenPlaces' augmentation: colour jitter, then a crop (Berton et al. 2022).
 
 Torchvision's `ColorJitter` and `RandomResizedCrop` on tensors from 0 to 1, rounded to bytes at the
 end.
@@ -16,17 +16,17 @@ from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.shapes import Float32
 
 _LUMA = np.array([0.2989, 0.587, 0.114], np.float32)
-"""Torchvision's weights of grey."""
+"""Torchvision's weights for grey."""
 _ASPECTS = (3 / 4, 4 / 3)
-"""Least and largest aspect ratio of a crop."""
+"""Smallest and largest aspect ratio of a crop."""
 _TRIES = 10
-"""Number of crops that are drawn before the largest central one is taken."""
+"""Number of random crops to try before using the largest central one."""
 _Floats = Float32[np.ndarray, "h w 3"]
 
 
 @AUGMENTATIONS.register("colour-crop")
 class ColourCropConfig(Augmentation):
-    """Changes of colour in random order, then a crop at the size of the image (CosPlace)."""
+    """Colour jitter in random order, then a crop resized to the image's size (CosPlace)."""
 
     brightness: NonNegativeFloat = 0.7
     """Largest relative change of brightness."""
@@ -35,7 +35,7 @@ class ColourCropConfig(Augmentation):
     saturation: NonNegativeFloat = 0.7
     """Largest relative change of saturation."""
     hue: Annotated[float, limited(0, 0.5)] = 0.5
-    """Largest turn of the hue, of 1 for a whole circle."""
+    """Largest turn of the hue; 1 is a full circle."""
     crop: Fraction = 0.5
     """Largest share of the area that a crop removes."""
 
@@ -64,7 +64,7 @@ class ColourCropConfig(Augmentation):
 
 
 def _turned(pixels: _Floats, turn: float) -> _Floats:
-    """Turn the hue of every pixel by a share of the circle."""
+    """Turn the hue of every pixel by a fraction of the circle."""
     hsv = cv2.cvtColor(pixels, cv2.COLOR_RGB2HSV)
     hsv[..., 0] = (hsv[..., 0] + 360 * turn) % 360
     return np.clip(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB), 0, 1)
@@ -73,7 +73,7 @@ def _turned(pixels: _Floats, turn: float) -> _Floats:
 def _crop(
     height: int, width: int, removed: float, generator: np.random.Generator
 ) -> tuple[int, int, int, int]:
-    """Draw top, left, height and width of a crop: a share of the area, and an aspect ratio."""
+    """Draw a crop by its area and aspect ratio, and return its top, left, height and width."""
     least, most = _ASPECTS
     for _ in range(_TRIES):
         area = height * width * generator.uniform(1 - removed, 1)

@@ -23,7 +23,7 @@ class LightAugmentConfig(Augmentation):
     rotation: NonNegativeFloat = 2.0
     """Largest rotation in degrees."""
     flip: Share = 0.0
-    """Probability of a mirror image. All images of one place in a batch are mirrored alike."""
+    """Probability of mirroring. All images of one place in a batch are mirrored together."""
     blur: NonNegativeFloat = 1.0
     """Largest standard deviation of a Gaussian blur, in pixels."""
     colour: Fraction = 0.2
@@ -31,14 +31,14 @@ class LightAugmentConfig(Augmentation):
     grey: Share = 0.2
     """Probability of dropping the colour."""
     gamma: NonNegativeFloat = 0.0
-    """Largest change of the logarithm of an exponent on intensities."""
+    """Largest change of log gamma, the exponent of intensities."""
     illumination: NonNegativeFloat = 0.0
     """Largest change of log brightness in a smooth field over the image: uneven light."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Mirror all images of a place alike, then change this one."""
+        """Mirror all images of a place together, then change this one."""
         if self.flip > 0 and of_place.random() < self.flip:
             image = cv2.flip(image, 1)
         return self.change_light(image, generator)

@@ -1,4 +1,4 @@
-"""RandAugment (Cubuk et al., CVPR Workshops 2020), with torchvision's strengths in Pillow's way."""
+"""RandAugment (Cubuk et al., CVPR Workshops 2020): torchvision's strengths, Pillow's pixels."""
 
 import functools
 import math
@@ -14,27 +14,27 @@ from crisalad_jax.utils.shapes import Int64, UInt8
 
 MAGNITUDE_BINS = 31
 
-# ITU-R BT.601 luma, which Pillow's convert("L") has in 16-bit fixed point. The last
-# column rounds. All sums of these are multiples of 2**-16 below 2**8: exact in float32.
+# ITU-R BT.601 luma, in 16-bit fixed point as in Pillow's convert("L"). The last column
+# rounds. All sums of these are multiples of 2**-16 below 2**8: exact in float32.
 _PILLOW_LUMA = np.array([[19595, 38470, 7471, 0x8000]]) / 2**16
 _LEVELS = np.arange(256)
 
 
 @AUGMENTATIONS.register("rand-augment")
 class RandAugmentConfig(Augmentation):
-    """RandAugment (Cubuk et al. 2020), torchvision's 14 operations, GSV-Cities' strength."""
+    """RandAugment (Cubuk et al. 2020): torchvision's 14 operations, GSV-Cities' strength."""
 
     operations: NonNegativeInt = 3
     magnitude: Annotated[int, limited(0, MAGNITUDE_BINS - 1)] = 9
-    """Which of 31 bins of strength."""
+    """Strength, one of 31 bins."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Apply some of `OPERATIONS`, drawn uniformly with replacement, of random sign.
+        """Apply some of `OPERATIONS`, drawn uniformly with replacement, with random signs.
 
         The result is that of torchvision's RandAugment on Pillow images, with bilinear
-        interpolation and black fill. Images must already have the size of the model.
+        interpolation and black fill. Images must already have the model's size.
         """
         names = list(OPERATIONS)
         for number in generator.integers(len(names), size=self.operations):
@@ -49,7 +49,7 @@ class RandAugmentConfig(Augmentation):
 def _affine(image: Image, a: float, b: float, c: float, d: float, e: float, f: float) -> Image:
     """Transform as Pillow's AFFINE, BILINEAR: output (x, y) shows input (ax+by+c, dx+ey+f).
 
-    Coordinates are of pixel centres, at halves. Points outside the image are black.
+    Pixel centres are at half coordinates. Points outside the image are black.
     """
     height, width = image.shape[:2]
     matrix = np.array([[a, b, c + (a + b - 1) / 2], [d, e, f + (d + e - 1) / 2]])
@@ -69,7 +69,7 @@ def _affine(image: Image, a: float, b: float, c: float, d: float, e: float, f: f
 
 @functools.lru_cache(maxsize=64)
 def _shown(height: int, width: int, *matrix: float) -> UInt8[np.ndarray, "height width"]:
-    """Mark with 1 where `_affine` shows a point of the image (cached: matrices are few)."""
+    """Mark with 1 where `_affine` shows a point of the image (cached: there are few matrices)."""
     a, b, c, d, e, f = matrix
     x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
     column, row = a * x + (b * y + c), d * x + (e * y + f)
@@ -115,8 +115,8 @@ def _contrast(image: Image, change: float) -> Image:
 def _sharpness(image: Image, change: float) -> Image:
     kernel = np.array([[1, 1, 1], [1, 5, 1], [1, 1, 1]], np.float32)
     sums = cv2.filter2D(image, cv2.CV_16S, kernel)
-    smooth = cv2.convertScaleAbs(sums, alpha=1 / 13)  # no sum is at a half: 13 is odd
-    # Pillow's 3x3 filters leave the outermost pixels alone.
+    smooth = cv2.convertScaleAbs(sums, alpha=1 / 13)  # no ties in rounding: 13 is odd
+    # Pillow's 3x3 filters do not change the outermost pixels.
     smooth[[0, -1]] = image[[0, -1]]
     smooth[:, [0, -1]] = image[:, [0, -1]]
     return _blend(smooth, image, 1 + change)
@@ -174,7 +174,7 @@ class Operation(NamedTuple):
 
     apply: Callable[[Image, float], Image]
     strength: Callable[[float, int, int], float]
-    """Strength for a magnitude as a fraction of its largest, a height and a width."""
+    """Strength from magnitude (as a fraction of its largest), height and width."""
     signed: bool
 
 

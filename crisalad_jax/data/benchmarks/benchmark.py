@@ -1,4 +1,4 @@
-"""An evaluation set: database, queries, and which database images are right for a query."""
+"""An evaluation set: database, queries, and the correct database images for each query."""
 
 import contextlib
 import dataclasses
@@ -23,24 +23,24 @@ class Benchmark:
     """One evaluation set, in the order in which its images are described."""
 
     name: str
-    """Name of exactly the images that were read, such as "sped_val/test (@UTM, 25 m)"."""
+    """Name for exactly the images read, such as "sped_val/test (@UTM, 25 m)"."""
     root: pathlib.Path
     database: tuple[pathlib.Path, ...]
     queries: tuple[pathlib.Path, ...]
     positives: tuple[Int64[np.ndarray, " _"], ...] | None
-    """Query -> ascending database indices; empty where the query has no match, which counts as a
-    miss. None where the set has no ground truth at all."""
+    """Query -> ascending database indices; empty if the query has no match, which counts as a
+    miss. None if the set has no ground truth at all."""
     rule: str
     """Rule that makes a database image positive, in words."""
     database_positions: Float64[np.ndarray, "database axis"] | None = None
-    """East and north in metres; of a set wider than one UTM zone points on the ellipsoid
-    (`metres.on_ellipsoid`). None where there are none, or only placeholders."""
+    """East and north in metres; if a set is wider than one UTM zone, points on the ellipsoid
+    (`metres.on_ellipsoid`). None if there are none or only placeholders."""
     query_positions: Float64[np.ndarray, "q axis"] | None = None
     radius: float = 25.0
     """Metres within which two positions show the same place."""
 
     def ground_truth(self) -> tuple[Int64[np.ndarray, " _"], ...]:
-        """Return `positives`, or raise where the set has no ground truth.
+        """Return `positives`, or raise if the set has no ground truth.
 
         Raises:
             InputError: the set has none.
@@ -56,7 +56,7 @@ class Benchmark:
     ) -> "Benchmark":
         """Return the set without the images that are marked as unreadable.
 
-        A query keeps its positives that are left. One without any is a miss, as in other sets.
+        A query keeps its remaining positives. One without any is a miss, as in other sets.
 
         Args:
             queries: whether each query could be read.
@@ -138,7 +138,7 @@ def within(
     """
     if not 0 <= radius < math.inf:
         raise InputError(f"radius: found {radius}, expected finite metres from 0")
-    import scipy.spatial  # takes a fifth of a second, which reading images does not need
+    import scipy.spatial  # the import takes a fifth of a second
 
     near = scipy.spatial.KDTree(database).query_ball_point(queries, radius, return_sorted=True)
     return tuple(np.array(references, np.int64) for references in near)

@@ -30,28 +30,28 @@ def read_folders(
 ) -> Benchmark:
     """Read `database/` and `queries/`, whose images may have any names.
 
-    The ground truth is `ground_truth.csv` in the same folder, or `frames`, or the positions of a
-    table, or there is none. The table of matches has lines of `query,database`, with paths
-    relative to the two folders: one line for each match of a query, or the line `query,` for a
-    query without a match. Every query has a line.
+    The ground truth is `ground_truth.csv` in the same folder, or `frames`, or a table of positions;
+    or there is none. The table of matches has lines of `query,database`, with paths relative to
+    the two folders: one line for each match of a query, or the line `query,` for a query without a
+    match. Every query has a line.
 
-    Positions are in `positions.csv`, which names images by their path, as `database/1.jpg`; or in
-    `database.csv` and `queries.csv`, which name them by their path in these folders. The columns
-    are `name,east,north` or `name,lat,lon`; degrees are projected to UTM if all are of one zone,
+    Positions are in `positions.csv`, which names images by their path, such as `database/1.jpg`; or
+    in `database.csv` and `queries.csv`, which name them by their path in these folders. The columns
+    are `name,east,north` or `name,lat,lon`; degrees are projected to UTM if all are in one zone,
     else they become points on the ellipsoid (`metres.comparable`).
 
     Args:
         root: the folder that holds the two, or one with `images/{test,val,train}` that do.
         split: None takes `test`, else `val`.
-        radius: where positions are the ground truth, metres within which an image is a positive,
+        radius: if positions are the ground truth, metres within which an image is a positive,
             inclusive; None is 25.
-        frames: the i-th query matches the database images i - frames to i + frames, where both
-            folders hold a frame of the same moments. Frames are in the order of the numbers in
-            their names, so that frame 10 follows frame 9.
+        frames: the i-th query matches the database images i - frames to i + frames, for two folders
+            with frames of the same moments. Frames are sorted by the numbers in their names, so
+            that frame 10 follows frame 9.
 
     Raises:
-        InputError: a folder is missing or without images; a table that names an image that is not
-            there, leaves one out, or contradicts itself; a negative number of frames, folders of
+        InputError: a folder is missing or without images; a table names an image that does not
+            exist, leaves one out, or contradicts itself; a negative number of frames, folders of
             different counts, `frames` with a table, a radius without positions to measure, one
             side's table of positions without the other's, or what `read_image_table` raises.
     """

@@ -51,28 +51,28 @@ def read_msls(
     subtask: bool = False,
     on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
-    """Read raw MSLS: all images but panoramas. A query without a match counts as a miss.
+    """Read raw MSLS: all images except panoramas. A query without a match counts as a miss.
 
-    VPR-datasets-downloader takes the same images: about 11,000 queries of val.
+    VPR-datasets-downloader uses the same images: about 11,000 queries of val.
 
-    With `subtask` it is what the official code reads for val, with its list of 740 queries: images
+    With `subtask`, read what the official code reads for val, with its list of 740 queries: images
     that `subtask_index.csv` marks as `all`. Queries need a database image within `radius`, by
-    distance alone; a `max_heading_difference` leaves the queries the same, and those that it leaves
+    distance only; a `max_heading_difference` does not change the queries, and those that it leaves
     without a match count as misses.
 
     Args:
-        root: the folder with `train_val/`, or that one.
-        split: `val` (the default) or `train`; those of its cities that are there.
+        root: the folder with `train_val/`, or `train_val/` itself.
+        split: `val` (the default) or `train`; its cities that are in the folder are read.
         radius: in metres, inclusive. Images of different cities never match.
         max_heading_difference: largest difference of two compass angles in degrees, inclusive, for
-            a match (the CriSALAD paper says 40); None lets any match, as the official code does.
-        subtask: whether to read the subtask `all` alone.
-        on_bad_image: "skip" lets images be missing, for whoever reads them to leave out.
+            a match (the CriSALAD paper says 40); None allows any, as the official code does.
+        subtask: whether to read only the subtask `all`.
+        on_bad_image: "skip" allows missing images, to be left out when they are read.
 
     Raises:
-        InputError: no such city, a table that is missing, without a column or of another length, a
-            field that is no number, images that are missing, a negative radius, an angle that is
-            not from 0 to 180.
+        InputError: no such city; a table that is missing, lacks a column or has another length; a
+            field that is not a number; missing images; a negative radius; or an angle that is not
+            from 0 to 180.
     """
     root, limit = pathlib.Path(root), max_heading_difference
     if limit is not None and not 0 <= limit <= 180:
@@ -116,7 +116,7 @@ def read_msls(
 
 
 def city_folders(root: pathlib.Path, cities: Collection[str]) -> list[pathlib.Path]:
-    """Find the folders of these cities; raises InputError where there is none of them."""
+    """Find the folders of these cities; raise InputError if none exists."""
     parent = root / "train_val" if (root / "train_val").is_dir() else root
     folders = [parent / city for city in cities if (parent / city).is_dir()]
     if not folders:
@@ -137,13 +137,13 @@ class _Side(NamedTuple):
     degrees: Float64[np.ndarray, "images 2"]
     """Latitude and longitude."""
     headings: Float64[np.ndarray, " images"]
-    """Compass angles in degrees; 0 where nothing asks for them."""
+    """Compass angles in degrees; 0 if not requested."""
     clusters: np.ndarray
-    """Texts of the place that each image is of, in the city; empty where nothing asks for them."""
+    """Names of each image's place, within the city; empty texts if not requested."""
 
 
 def _positions(sides: list[_Side]) -> Float64[np.ndarray, "images axis"]:
-    """Return the metres of one city, or points of several, each of which has its own zone."""
+    """Return the metres of one city; of several, which differ in zone, points on the ellipsoid."""
     if len(sides) == 1:
         return sides[0].metres
     return on_ellipsoid(*np.concatenate([side.degrees for side in sides]).T)

@@ -37,13 +37,13 @@ def read_netvlad(
         path: for instance `pitts30k_test.mat`.
         radius: in metres, inclusive; None takes the file's posDistThr.
         images: the folder with `000/...` (or `images/000/...`) and with the queries in
-            `queries_real/`, `queries/` or `query/`; None looks beside the file and one folder
-            further up.
-        on_bad_image: "skip" lets images be missing, for whoever reads them to leave out.
+            `queries_real/`, `queries/` or `query/`; None looks in the file's folder and the one
+            above.
+        on_bad_image: "skip" allows missing images, to be left out when they are read.
 
     Raises:
-        InputError: no such file, no dbStruct in it, counts that differ from its arrays, images that
-            are missing, a negative radius.
+        InputError: no such file, no dbStruct in it, counts that differ from its arrays, missing
+            images, or a negative radius.
     """
     path = pathlib.Path(path)
     expected, damaged = "a .mat file with dbStruct", "cannot be read as a .mat file"

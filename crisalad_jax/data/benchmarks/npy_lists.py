@@ -3,7 +3,7 @@
 VPR-Bench (Zaffar et al., IJCV 2021): `ref/`, `query/`, `ground_truth_new.npy`.
 
 The lists: `pitts30k_test_dbImages.npy`, `..._qImages.npy` and `..._gt.npy`. MSLS has
-`..._qIdx.npy` (indices of the evaluated queries) and `..._pIdx.npy` (their matches) in place of
+`..._qIdx.npy` (indices of the evaluated queries) and `..._pIdx.npy` (their matches) instead of
 `gt`.
 
 Published ground truths are arrays of lists, which numpy can only save as a pickle. They are read
@@ -51,12 +51,12 @@ def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
     code in the file is run.
 
     The published lists of GardensPointWalking and 17places are windows of frames, and the last ones
-    end after the last image. Such references are left out, and a note counts them.
+    extend past the last image. References past it are left out, and a note counts them.
 
     Raises:
         InputError: a folder or the file is missing, a number is skipped among the images' names,
             the file holds anything but plain arrays, lists and numbers, all references of a query
-            are out of range, a query has no row or two.
+            are out of range, or a query has no row or two rows.
     """
     root = pathlib.Path(root)
     database, queries = (_numbered(list_part(root / part)) for part in ("ref", "query"))
@@ -100,13 +100,13 @@ def read_salad_lists(
     Args:
         root: a folder with such lists, or one of the files.
         split: part of a set's name, such as `val`, where the folder has the lists of several sets.
-        images: the folder to which the names are relative; None looks beside the files and one
-            folder further up.
-        on_bad_image: "skip" lets images be missing, for whoever reads them to leave out.
+        images: the folder to which the names are relative; None looks in the folder of the files
+            and the one above.
+        on_bad_image: "skip" allows missing images, to be left out when they are read.
 
     Raises:
-        InputError: not the lists of just one set, a file that holds anything but names or indices,
-            counts that do not fit, an index that is out of range, images that are missing.
+        InputError: not the lists of exactly one set, a file that holds anything but names or
+            indices, counts that disagree, an index that is out of range, or missing images.
     """
     root = pathlib.Path(root)
     prefix, files = _choose(root, split)
@@ -138,7 +138,7 @@ def read_salad_lists(
 
 
 def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
-    """Find the lists of each set in a folder, or of the set that one of its files is of.
+    """Find the lists of each set in a folder, or of the set that a file belongs to.
 
     Returns:
         Prefix of the files' names -> the files. Sets without a database or queries are left out.
@@ -176,7 +176,7 @@ def _names(path: pathlib.Path) -> list[str]:
 
 
 def _read_rows(path: pathlib.Path, queries: int, *columns: int) -> np.ndarray:
-    """Read a row for each query, of so many columns where that is given."""
+    """Read a row for each query, checking the number of columns if given."""
     rows = np.atleast_1d(read_npy(path))
     if len(rows) != queries or (columns and rows.shape[1:] != columns):
         raise InputError(
@@ -187,7 +187,7 @@ def _read_rows(path: pathlib.Path, queries: int, *columns: int) -> np.ndarray:
 
 
 def _chosen(path: pathlib.Path, rows: np.ndarray, queries: int) -> list[int]:
-    """Return the indices of queries in some rows, of which each may be there once."""
+    """Return the indices of queries in some rows, checking that each occurs only once."""
     indices = [index for row in _indices(path, np.atleast_1d(rows)) for index in row.tolist()]
     if not indices or len({*indices} & {*range(queries)}) < len(indices):
         raise InputError(
@@ -220,7 +220,7 @@ def _read_matches(
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
     """Return the unique database indices of each row, ascending; -1 for no match is dropped.
 
-    With `windows`, indices after the last image are dropped too, where others are left.
+    With `windows`, indices after the last image are dropped too, if others remain.
     """
     matches, beyond = [], 0
     for number, row in enumerate(_indices(path, rows)):
@@ -264,7 +264,7 @@ _SAFE_NAMES = frozenset(
         ("__builtin__", "bytes"),
     )
 )
-"""All that a pickled array asks for; the last two spell bytes for Python 2. None of it runs code of
+"""All that a pickled array needs; the last two encode bytes for Python 2. None of it runs code from
 the file, calls back into it, or can be changed by it."""
 
 
@@ -299,13 +299,13 @@ def _read_array(file: io.BytesIO) -> np.ndarray:
 
 
 class _Unpickler(pickle._Unpickler):
-    """Looks up `_SAFE_NAMES` alone.
+    """Looks up only `_SAFE_NAMES`.
 
-    Python's own: the one in C allocates as much memory as a damaged file says.
+    It is the pure-Python one: the one in C allocates as much memory as a damaged file says.
     """
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:
-        # numpy 2 moved its modules, and files of numpy 1 and 2 both exist.
+        # numpy 2 moved its modules, and files from numpy 1 and 2 both exist.
         module = module_name.replace("numpy.core.", "numpy._core.")
         if (module, global_name) not in _SAFE_NAMES:
             raise pickle.UnpicklingError(f"the file asks for {module}.{global_name}")

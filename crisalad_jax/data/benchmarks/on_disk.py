@@ -1,4 +1,4 @@
-"""Folders, splits and images on disk, which several readers look for."""
+"""Find folders, splits and images on disk, for several readers."""
 
 import os
 import pathlib
@@ -14,7 +14,7 @@ SPLITS = ("test", "val", "train")
 
 
 def find_database(folder: pathlib.Path) -> pathlib.Path:
-    """Return the folder `database/`, or `gallery/` (SVOX) where there is none."""
+    """Return the folder `database/`, or `gallery/` (SVOX) if there is none."""
     gallery = folder / "gallery"
     database = folder / "database"
     return gallery if is_folder(gallery) and not is_folder(database) else database
@@ -38,7 +38,7 @@ def list_part(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
 
 
 def listing(folder: pathlib.Path) -> str:
-    """Describe in a message what a folder holds."""
+    """Describe the contents of a folder for a message."""
     if not is_folder(folder):
         return "a file" if is_file(folder) else "no such folder"
     return shown(name + "/" * is_folder(folder / name) for name in list_names(folder))
@@ -52,7 +52,7 @@ def shown(names: Iterable[str]) -> str:
 
 
 def has_split(root: pathlib.Path) -> bool:
-    """Return whether any of `images/{test,val,train}` is there."""
+    """Return whether any of `images/{test,val,train}` exists."""
     return any(is_folder(root / "images" / split) for split in SPLITS)
 
 
@@ -60,12 +60,12 @@ def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str
     """Find the folder that holds database/ and queries/, and its name.
 
     The folder is `root` itself or one of `images/{test,val,train}`. Without `split` it is the first
-    of test and val that is there.
+    of test and val that exists.
 
     Raises:
         InputError: there is none.
     """
-    # resolve: a root of "." still has a name to print
+    # Resolved, so that a root of "." has a name to print too.
     resolved = real_path(root)
     if split is None and has_sides(root):
         if resolved.parent.name == "images":
@@ -92,14 +92,14 @@ def find_images(
 
     Args:
         named_by: the file.
-        names: the images'.
-        images: the folder that holds them; None is that of the file, or the one above.
-        on_bad_image: under "skip" some may be missing, and whoever reads them leaves them out.
-        folders: folders in it that names may be relative to, of which the first that has any of
-            the images is taken.
+        names: the images' names.
+        images: the folder that holds them; None looks in that of the file, and the one above.
+        on_bad_image: under "skip" some may be missing, to be left out when they are read.
+        folders: folders in it that names may be relative to; the first that has any of the images
+            is used.
 
     Raises:
-        InputError: some are missing; how many, and which is the first.
+        InputError: some are missing; the message counts them and names the first.
     """
     near = (named_by.parent, named_by.parent.absolute().parent)
     tops = near if images is None else (pathlib.Path(images),)

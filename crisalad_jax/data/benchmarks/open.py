@@ -32,7 +32,7 @@ LAYOUTS: dict[str, Callable[..., Benchmark]] = {
     "msls-subtask": functools.partial(read_msls, subtask=True),
     "folders": read_folders,
 }
-"""Reader of each layout. It takes a path, then any of `open_benchmark`'s options by their names."""
+"""Reader of each layout. It takes a path, then any of `open_benchmark`'s options by name."""
 
 
 @takes(root=PATH)
@@ -49,22 +49,22 @@ def open_benchmark(
     layout: str | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
-    """Read an evaluation set of the given `layout`, or of the layout that its files show.
+    """Read an evaluation set in the given `layout`, or in the one detected from its files.
 
     An option that is None takes the default of the layout's reader: `read_utm`,
     `read_vpr_bench`, `read_netvlad`, `read_salad_lists`, `read_msls` or `read_folders`.
 
     Args:
-        root: a folder, or a file of NetVLAD's or SALAD's.
+        root: a folder, or one of NetVLAD's or SALAD's files.
         split: test, val or train.
         radius: largest distance of a positive in metres.
         images: the folder of the images that a file names.
         max_heading_difference: largest difference of headings of a positive in degrees.
         frames: largest number of frames between a query and a positive.
-        queries: the folder of the queries, where there are several.
-        ignore_zones: whether @UTM numbers of all zones are compared as if of one plane.
-        layout: one of `LAYOUTS`; `msls-subtask` is never found from the files.
-        on_bad_image: "stop" where an image that a file names is missing; under "skip" it is in the
+        queries: the folder of the queries, if there are several.
+        ignore_zones: whether to compare @UTM coordinates of all zones as if in one plane.
+        layout: one of `LAYOUTS`; `msls-subtask` is never detected from the files.
+        on_bad_image: "stop" if an image that a file names is missing; under "skip" it stays in the
             set, and `evaluate` leaves it out.
 
     Returns:

@@ -24,7 +24,7 @@ QUERIES = "queries"
 """Default folder of the queries."""
 _PLACE_METRES = 1000.0
 _PAIRED = {607: "SPED", 1231: "AmsterTime"}
-"""Sets whose places have an image on each side, and no coordinates, by how many they are."""
+"""Sets whose places have one image on each side, and no coordinates, by their number of places."""
 _NORDLANDS = {
     25 / 10.5: "Nordland, Patch-NetVLAD split (summer database, winter queries)",
     25 / 1.5: "Nordland subset of VPR-datasets-downloader (summer database, winter queries)",
@@ -46,8 +46,8 @@ def read_utm(
 ) -> Benchmark:
     """Read `@UTM_east@UTM_north@zone@letter@...` images; a positive is at most `radius` m away.
 
-    Distances are those of east and north between images of one zone and hemisphere, and those on
-    the ground between others.
+    Distances between images of one zone and hemisphere are those of east and north; between others,
+    they are those on the ground.
 
     VPR-datasets-downloader writes placeholder coordinates for Nordland (easting 0, frames
     25 / 10.5 m apart), SPED and AmsterTime (easting 0, places 1 km apart). The benchmark's name
@@ -58,14 +58,14 @@ def read_utm(
             `queries/`; SVOX's database is in `gallery/`.
         split: None takes `test`, else `val`.
         radius: in metres, inclusive.
-        queries: the folder of the queries: SVOX has `queries_night` and others beside `queries`.
-            The benchmark's name says which, unless it is `queries`.
-        ignore_zones: whether the numbers of all zones are compared as if of one plane, as the
-            public tools do. The name of a benchmark with several zones then says so.
+        queries: the folder of the queries: SVOX has `queries`, `queries_night` and others. The
+            benchmark's name says which, unless it is `queries`.
+        ignore_zones: whether to compare coordinates of all zones as if in one plane, as the public
+            tools do. The name of a benchmark with several zones then says so.
 
     Raises:
-        InputError: no such split or folder, a folder without images, a name without coordinates,
-            or without a zone where others are of several, a negative radius.
+        InputError: no such split or folder, a folder without images, a name without coordinates, a
+            name without a zone in a set of several zones, or a negative radius.
     """
     root = pathlib.Path(root)
     if not queries.startswith(QUERIES):
@@ -127,14 +127,14 @@ def _across_zones(
 ) -> tuple[tuple[Int64[np.ndarray, " _"], ...], _Points, _Points]:
     """Find the positives of a set of several zones, and both sides' points on the ellipsoid.
 
-    Images of one zone match by its metres, so that published sets such as MSLS, with a city a
+    Images of one zone match by its metres, so that published sets such as MSLS, with one city per
     zone, have the positives that other tools find.
     """
     degrees = utm_degrees(names, zones, np.concatenate([places, asked]))
     there, here = np.split(on_ellipsoid(*degrees.T), [len(places)])
     zone_there, zone_here = np.split(np.array(zones), [len(places)])
     positives = []
-    # A zone's scale is at least 0.9996: what is near in its plane is about as near on the ground.
+    # A zone's scale is at least 0.9996: images close in its plane are about as close on the ground.
     for query, near in enumerate(within(there, here, 1.001 * radius)):
         in_zone = (zone_there[near] == zone_here[query]).all(axis=1)
         plane = np.linalg.norm(places[near] - asked[query], axis=1)

@@ -1,4 +1,4 @@
-"""Samplers: which places, and which of their images, make the batches of an epoch."""
+"""Samplers choose the places, and their images, for the batches of an epoch."""
 
 import abc
 import itertools
@@ -17,7 +17,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Int
 
 _TURNS = 20
-"""Turns without a batch after which none is expected."""
+"""Number of turns without a batch before giving up."""
 
 Describe = Callable[[Sequence[pathlib.Path]], Float[np.ndarray, "n descriptor"]]
 """Takes image files; returns their descriptors, NaN for images that cannot be read."""
@@ -25,7 +25,7 @@ Describe = Callable[[Sequence[pathlib.Path]], Float[np.ndarray, "n descriptor"]]
 
 @brief
 class Draw(NamedTuple):
-    """What a sampler draws by: the size of a batch, the epoch, and its random numbers."""
+    """The input of a sampler: the size of a batch, the epoch, and random numbers."""
 
     places_per_batch: int
     images_per_place: int
@@ -34,13 +34,13 @@ class Draw(NamedTuple):
     generator: np.random.Generator
     """Draws the same for the same seed and epoch."""
     described: Int[np.ndarray, " n"]
-    """Images of `Sampler.images_to_describe`; none where `Sampler.describes` is False."""
+    """Images of `Sampler.images_to_describe`; none if `Sampler.describes` is False."""
     descriptors: Float[np.ndarray, "n descriptor"]
-    """Their descriptors by the model as it is; NaN for images that cannot be read."""
+    """Their descriptors by the current model; NaN for images that cannot be read."""
 
 
 class Sampler(Part, abc.ABC):
-    """The way batches are drawn from places: a frozen dataclass with its settings as fields.
+    """A way to draw batches from places: a frozen dataclass with its settings as fields.
 
     A plain function of (places, draw) is a sampler without settings.
 
@@ -56,34 +56,34 @@ class Sampler(Part, abc.ABC):
     """
 
     describes: ClassVar[bool] = False
-    """Whether it draws by descriptors, which the model makes as it is when an epoch begins."""
+    """Whether it uses descriptors, which the current model makes when an epoch begins."""
     regroups: ClassVar[bool] = False
-    """Whether it makes places of its own: images of a group may be of several of the set's places,
-    and of these some may have few images."""
+    """Whether it makes its own places: a group may mix images of several of the set's places, some
+    of which may have few images."""
 
     def check(self, places: Places) -> None:
-        """Raise InputError where it cannot draw from these places; by default never."""
+        """Raise InputError if it cannot draw from these places; by default never."""
 
     def images_to_describe(
         self, places: Places, generator: np.random.Generator
     ) -> Int[np.ndarray, " n"]:
-        """Return the images of `Draw.descriptors`; by default one of each place, drawn anew."""
+        """Return the images of `Draw.descriptors`; by default a random one of each place."""
         return generator.integers(places.place_start[:-1], places.place_start[1:])
 
     @abc.abstractmethod
     def apply(
         self, places: Places, draw: Draw
     ) -> Int[np.ndarray, " order"] | Int[np.ndarray, "steps places images"]:
-        """Draw batches, as many as take every place about once.
+        """Draw enough batches to use every place about once.
 
         Args:
             places: the training set.
             draw: the size of a batch, and random numbers.
 
         Returns:
-            Places in an order, of which consecutive ones make a batch, or the images of every
-            batch. In an order a place may be missing, or come again; then it has other images. A
-            place that is `Places.near` another of its batch goes into the next.
+            Places in an order, in which consecutive ones make a batch, or the images of every
+            batch. An order may omit a place, or repeat it with other images. A place that is
+            `Places.near` another of its batch moves to the next.
         """
 
 
@@ -103,28 +103,28 @@ def epoch_batches(
 ) -> Int[np.ndarray, "steps places images"]:
     """Draw the images of every batch of an epoch, as a function of (seed, epoch).
 
-    Of each place `images_per_place` images are sampled without replacement. An incomplete last
+    From each place, `images_per_place` images are sampled without replacement. An incomplete last
     batch is dropped. With `steps` the epoch has exactly this number of batches: it is cut short, or
-    continued with new draws. Without, the number may differ from epoch to epoch where places are
+    continued with new draws. Without it, the number may differ from epoch to epoch if places are
     `Places.near` each other.
 
     Args:
         places: the training set.
-        sampler: what draws; a registered sampler, or its name.
-        places_per_batch: number of places of a batch.
-        images_per_place: number of images of each.
-        seed: draws, with the epoch.
-        epoch: from 0.
-        steps: number of batches; None is what the sampler draws in a turn.
+        sampler: a registered sampler, or its name.
+        places_per_batch: number of places in a batch.
+        images_per_place: number of images of each place.
+        seed: seeds the draws, together with the epoch.
+        epoch: number of the epoch, from 0.
+        steps: number of batches; None takes what the sampler draws in a turn.
         describe: describes images; for samplers with `Sampler.describes`.
 
     Returns:
-        Numbers of images.
+        Indices of images.
 
     Raises:
         InputError: a place has too few images, the sampler finds no batch, or returns anything but
             what `Sampler.apply` says; no such sampler, a negative seed or epoch, less than one
-            step, or no `describe`.
+            step, or a missing `describe`.
     """
     drawn_by = SAMPLERS.resolve(sampler, "sampler")
     least = 1 if steps is None else steps
@@ -177,7 +177,7 @@ def epoch_batches(
 def labels_of(
     places: Places, sampler: Sampler, chosen: Int[np.ndarray, "steps places images"]
 ) -> Int[np.ndarray, "steps places images"]:
-    """Return the images' places; numbers in the batch where the sampler makes places of its own."""
+    """Return the images' places; group numbers in the batch if the sampler makes its own places."""
     if sampler.regroups:
         return np.broadcast_to(np.arange(chosen.shape[1], dtype=np.int32)[:, None], chosen.shape)
     return places.image_place[chosen]
@@ -210,7 +210,7 @@ def _draw(places: Places, sampler: Sampler, draw: Draw) -> Int[np.ndarray, "step
 def _images_of(
     places: Places, chosen: Int[np.ndarray, "steps places"], draw: Draw
 ) -> Int[np.ndarray, "steps places images"]:
-    """Sample images of places without replacement; of one that comes again, those that are left."""
+    """Sample images of places without replacement; a repeated place gets its remaining images."""
     # Sorting all images by (place, random key) shuffles the images within each place.
     shuffled = np.lexsort((draw.generator.random(len(places.files)), places.image_place))
     flat = chosen.reshape(-1)

@@ -1,8 +1,8 @@
-"""CliqueMining, and SAGE's: places made of images that are close together, in alike streets.
+"""CliqueMining, and SAGE's version: places made of images close together, in similar streets.
 
 Written from the paper (Izquierdo and Civera, "Close, But Not There: Boosting Geographic Distance
 Sensitivity in Visual Place Recognition", ECCV 2024). There an earlier model describes the clusters
-once; here the model that is trained does, when an epoch begins.
+once; here the model being trained describes them when an epoch begins.
 """
 
 import collections
@@ -19,11 +19,11 @@ from crisalad_jax.utils.shapes import Float, Int
 
 @SAMPLERS.register("cliques")
 class Cliques(Sampler):
-    """Groups of images within `radius` of each other, and of no image of another group.
+    """Groups of images within `radius` of each other, but not of an image of another group.
 
-    A batch begins with a random place of the set, and others of its city that are drawn the more
-    likely the more they look like it. Their images are cut into groups; where these do not fill the
-    batch, it goes on with another city.
+    A batch begins with a random place of the set, and others of its city, which are more likely to
+    be drawn the more they look like it. Their images are divided into groups; if these do not fill
+    the batch, it continues with another city.
     """
 
     describes: ClassVar[bool] = True
@@ -31,7 +31,7 @@ class Cliques(Sampler):
     radius: PositiveFloat = 25.0
     """Metres."""
     similar: NonNegativeInt = 15
-    """Number of places that are drawn by their likeness to a random one."""
+    """Number of places drawn by their similarity to a random one."""
 
     def check(self, places: Places) -> None:
         """Require positions of all cities.
@@ -42,7 +42,7 @@ class Cliques(Sampler):
         known_views(places, f"sampler {self.part_name}", headings=False)
 
     def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, "steps places images"]:
-        """Return as many batches as would take every place once; fewer where some do not fill."""
+        """Return enough batches to use every place once; fewer if some cannot be filled."""
         views = views_of(places)
         steps = max(1, len(places.names) // draw.places_per_batch)
         batches = (self._batch(places, views, draw) for _ in range(steps))
@@ -53,7 +53,7 @@ class Cliques(Sampler):
     def _batch(
         self, places: Places, views: Views, draw: Draw
     ) -> Int[np.ndarray, "places images"] | None:
-        """Draw a batch; None where all places together do not fill one."""
+        """Draw a batch; None if all places together do not fill one."""
         points = np.column_stack([views.east, views.north])
         left, in_new_city = np.ones((2, len(places.names)), bool)
         groups: list[np.ndarray] = []
@@ -87,11 +87,11 @@ class Cliques(Sampler):
     def _similar(
         self, first: int, others: Int[np.ndarray, " place"], draw: Draw
     ) -> Int[np.ndarray, " place"]:
-        """Draw places by the likeness of their descriptors to that of `first`, which is one."""
+        """Draw places by how similar their descriptors are to that of `first`, and add `first`."""
         others = others[others != first]
         difference = draw.descriptors[others] - draw.descriptors[first]
         distances = np.sqrt((difference * difference).sum(axis=1))
-        # One whose image cannot be read is as far as the farthest, and so not drawn.
+        # A place whose image cannot be read is as far as the farthest, and so is not drawn.
         farthest = np.nan_to_num(distances).max(initial=0)
         likeness = farthest - np.nan_to_num(distances, nan=farthest)
         if not likeness.any():
@@ -107,15 +107,15 @@ class Cliques(Sampler):
 class GeoVisual(Cliques):
     """Cliques of a neighbourhood that grows greedily from a place that looks like many others.
 
-    Written from the abstract of SAGE (Chen et al., ICLR 2026), whose code of training is not
-    published: its graph is made anew before each epoch, of where images are and how alike they look
-    to the model as it is; clusters begin at anchors of high affinity, and expand by a greedy
-    weighted clique. The numbers here are ours.
+    Written from the abstract of SAGE (Chen et al., ICLR 2026), whose training code is not
+    published: its graph is rebuilt before each epoch from the positions of images and how similar
+    they look to the current model; clusters begin at anchors of high affinity, and expand by a
+    greedy weighted clique. The numbers here are ours.
     """
 
     anchors: PositiveInt = 16
-    """Number of random places of which that of the highest affinity begins: the mean likeness to
-    the `similar` places of its city that are most like it."""
+    """Number of random places, of which the one of highest affinity begins: the mean similarity to
+    the `similar` most similar places of its city."""
 
     def _first(self, among: Int[np.ndarray, " place"], places: Places, draw: Draw) -> int:
         drawn = draw.generator.choice(among, min(self.anchors, len(among)), replace=False)
@@ -129,7 +129,7 @@ class GeoVisual(Cliques):
     def _similar(
         self, first: int, others: Int[np.ndarray, " place"], draw: Draw
     ) -> Int[np.ndarray, " place"]:
-        """Add the place that is most like all that are chosen, one after the other."""
+        """Add the place that is most similar to all chosen ones, one at a time."""
         others = others[others != first]
         chosen, total = [first], np.zeros(len(others))
         for _ in range(min(self.similar, len(others))):
@@ -142,17 +142,17 @@ class GeoVisual(Cliques):
 def _alike(
     draw: Draw, others: Int[np.ndarray, " place"], place: int
 ) -> Float[np.ndarray, " place"]:
-    """Return the likeness of places to one, from -1 to 1; -1 where an image cannot be read."""
+    """Return the similarity of places to one, from -1 to 1; -1 if an image cannot be read."""
     return np.nan_to_num(draw.descriptors[others] @ draw.descriptors[place], nan=-1.0)
 
 
 def _cliques(
     points: Float[np.ndarray, "image 2"], radius: float, size: int
 ) -> list[Int[np.ndarray, " clique"]]:
-    """Find groups of at least `size` points within a radius of each other, apart by the radius.
+    """Find groups of at least `size` points within a radius of each other, a radius apart.
 
-    A group grows from the first point that is left by the nearest that is within the radius of all
-    its members, so it is maximal; then its neighbours are left out.
+    A group starts at the first remaining point and adds the nearest point within the radius of all
+    its members until it is maximal; then its neighbours are left out.
     """
     distances = _distances(points, points)
     found, left = [], np.ones(len(points), bool)

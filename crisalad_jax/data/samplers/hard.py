@@ -11,22 +11,22 @@ from crisalad_jax.utils.shapes import Int
 
 @SAMPLERS.register("hard-negatives")
 class HardNegatives(Sampler):
-    """A random place and those that look most like it, by the model when an epoch begins.
+    """A random place and those that look most like it to the model when an epoch begins.
 
-    An image stands for each place. GPM (Ali-bey et al., BMVC 2022) draws such batches by proxies
+    One image represents each place. GPM (Ali-bey et al., BMVC 2022) draws such batches by proxies
     that are trained with the model.
     """
 
     describes: ClassVar[bool] = True
 
     def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, " order"]:
-        """Return every place once, each batch's first at random, the others nearest to it first."""
+        """Return every place once: each batch is a random one and those nearest to it."""
         left = draw.generator.permutation(len(places.names))
         order = []
         while len(left):
-            # Of all places: to take out those that are left would copy their descriptors each time.
+            # For all places: indexing the remaining ones would copy their descriptors each time.
             similarity = (draw.descriptors @ draw.descriptors[left[0]])[left]
-            # A place whose image cannot be read is like no other.
+            # A place whose image cannot be read is not similar to any other.
             similarity = np.nan_to_num(similarity, nan=-np.inf)
             similarity[0] = np.inf
             nearest = np.argsort(-similarity, kind="stable")[: draw.places_per_batch]

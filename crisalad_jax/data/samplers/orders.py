@@ -1,4 +1,4 @@
-"""Random places, of all cities or of one in a batch."""
+"""Random places, from all cities or from one per batch."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ class Shuffled(Sampler):
 
 @SAMPLERS.register("within-city")
 class WithinCity(Sampler):
-    """City after city in random order, as the public loaders draw.
+    """City after city in random order, as in the public loaders.
 
     A batch is then nearly always of one city, whose places are hard to tell apart.
     """

@@ -1,4 +1,4 @@
-"""EigenPlaces' classes as places, for losses of pairs (Berton et al., ICCV 2023)."""
+"""EigenPlaces' classes as places, for pair losses (Berton et al., ICCV 2023)."""
 
 import collections
 import functools
@@ -22,14 +22,14 @@ class Viewpoints(Sampler):
     """Images that look at one point, from different positions of a street.
 
     The places of a batch are classes of one of EigenPlaces' groups, none of which are neighbours.
-    MegaLoc trains on both sides at once, each in a sub-batch of its own.
+    MegaLoc trains on both sides at once, each in its own sub-batch.
     """
 
     regroups: ClassVar[bool] = True
     side: Literal["lateral", "frontal"] = "lateral"
     """Whether the point is across the street or along it."""
     cell: PositiveFloat = 15.0
-    """Side of a cell in metres, whose images are of one class of each side at most."""
+    """Side of a cell in metres; its images make at most one class of each side."""
     spacing: PositiveInt = 3
     """Distance in cells between classes of a batch."""
     focal_distance: PositiveFloat = 10.0
@@ -46,7 +46,7 @@ class Viewpoints(Sampler):
         known_views(places, f"sampler {self.part_name}", headings=True)
 
     def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, "steps places images"]:
-        """Return batches that take each class once, but for the rest of each group."""
+        """Return batches that use each class once, except for the remainder of each group."""
         groups: dict[int, list[np.ndarray]] = collections.defaultdict(list)
         for each in self._classes(places, draw.images_per_place):
             groups[each.group].append(each.images)
@@ -74,5 +74,5 @@ class Viewpoints(Sampler):
 
 @functools.lru_cache(maxsize=4)
 def _found(places: Places, config: ClassesConfig, min_images: int) -> Sequence[Sequence[Class]]:
-    """Find the classes of both sides; an epoch may take several turns of them."""
+    """Find the classes of both sides (cached: an epoch may take several turns of them)."""
     return find_classes(places, config, min_images)

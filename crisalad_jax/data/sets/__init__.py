@@ -1,4 +1,4 @@
-"""Public data sets by name: a table of them, their download, and what a folder is."""
+"""Public data sets by name: a table of them, their download, and the check of a folder."""
 
 from crisalad_jax.data.sets.check import CheckedFolder as CheckedFolder
 from crisalad_jax.data.sets.check import CheckedPart as CheckedPart

@@ -1,4 +1,4 @@
-"""Say what a folder of data is, and whether it has the counts that are published."""
+"""Identify the data set in a folder, and compare its counts with the published ones."""
 
 import dataclasses
 import os
@@ -25,24 +25,24 @@ class CheckedPart:
     """A part of a folder: a split, or a folder of queries."""
 
     name: str
-    """What `open_benchmark` calls it; of one that cannot be opened, where it is."""
+    """Its name by `open_benchmark`; if it cannot be opened, its location."""
     database: int | None = None
-    """Number of images; of training places, of all."""
+    """Number of database or training images."""
     queries: int | None = None
-    """Number of queries; of training places, of places."""
+    """Number of queries, or of training places."""
     known: str | None = None
-    """The published set and its part that have these counts; None where none has."""
+    """The published set and part with these counts; None if there is none."""
     problem: str | None = None
-    """What is missing, unreadable or not as published; None where nothing is."""
+    """What is missing, unreadable or not as published; None if nothing is."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CheckedFolder:
-    """What a folder is."""
+    """The result of checking a folder."""
 
     parts: tuple[CheckedPart, ...]
     absent: tuple[str, ...] = ()
-    """Parts of the expected set that are not there."""
+    """Parts of the expected set that are missing."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -58,20 +58,20 @@ def check_set(
     read: bool = True,
     quiet: bool = False,
 ) -> CheckedFolder:
-    """Count a folder's images, name what it is, and compare with the published counts.
+    """Count a folder's images, identify its data set, and compare with the published counts.
 
-    Every split, every folder of queries and every file of lists in it is opened as `evaluate` opens
-    it, or GSV-Cities' layout as `train` does.
+    Every split, every folder of queries and every file of lists in it is opened as `evaluate` does,
+    or GSV-Cities' layout as `train` does.
 
     Args:
         folder: the folder, or one file of lists in it.
-        expected: name of the set in `SETS` that it should be; None is any, and a set of one's own
+        expected: name of the set in `SETS` that it should be; None allows any, and a custom set
             then has nothing to compare with.
         read: whether to decode every image too.
         quiet: whether to show no progress bar.
 
     Returns:
-        What it is, with what is wrong.
+        The parts of the folder, with their problems.
 
     Raises:
         InputError: there is no such set, or no data in a layout of docs/datasets.md.
@@ -95,7 +95,7 @@ def check_set(
         raise InputError(f"{root}: found no Dataframes/, expected {published.title}")
     openings = _openings(root, published)
     parts = [
-        # The official queries of MSLS are some of all, which follow.
+        # The official queries of MSLS are among all its queries, which are read next.
         _checked(root, each, published, read=read and "layout" not in each, quiet=quiet)
         for each in openings
     ]
@@ -148,7 +148,7 @@ def _checked(
         benchmark = open_benchmark(root, **options)
     except InputError as error:
         if root == folder and not options:
-            raise  # no layout of docs/datasets.md, or the only part
+            raise  # not a layout of docs/datasets.md, or the only part
         return CheckedPart("/".join(map(str, options.values())) or root.name, problem=str(error))
     known = _known(benchmark, published)
     problems = [] if known else _differences(folder, benchmark, published, options)
@@ -159,11 +159,11 @@ def _checked(
 
 
 def _known(benchmark: Benchmark, published: PublishedSet | None) -> str | None:
-    """Name the published parts that a benchmark is, by its counts or its name."""
+    """Name the published parts that match a benchmark, by its counts or its name."""
     found = []
     for each in SETS.values() if published is None else [published]:
         for part in each.parts:
-            # Of a part whose database is not known, the number of queries alone is no proof.
+            # If a part's database count is unknown, the number of queries is not proof enough.
             is_proof = published is not None or part.printed or part.database is not None
             if is_proof and _fits(part, benchmark):
                 found.append(f"{each.name}, {part.name}")
@@ -171,7 +171,7 @@ def _known(benchmark: Benchmark, published: PublishedSet | None) -> str | None:
 
 
 def _fits(part: SetPart, benchmark: Benchmark) -> bool:
-    """Return whether a part's published counts, and its name, are a benchmark's."""
+    """Return whether a benchmark has a part's published counts and name."""
     pairs = ((part.database, benchmark.database), (part.queries, benchmark.queries))
     same = all(count is None or count == len(images) for count, images in pairs)
     return same and re.match(part.printed, benchmark.name) is not None
@@ -183,11 +183,11 @@ def _differences(
     published: PublishedSet | None,
     options: dict[str, Any],
 ) -> list[str]:
-    """Say how a benchmark differs from the set that it should be, by its folder's name too."""
+    """Describe how a benchmark differs from the expected set, or from the one its folder names."""
     published = published or SETS.get(real_path(folder).name.lower().replace("_", "-"))
     parts = () if published is None else published.parts
     split = options.get("split")
-    if split is not None:  # of a split that the table does not have nothing is known
+    if split is not None:  # nothing is known about a split that the table lacks
         parts = tuple(part for part in parts if part.name not in SPLITS or part.name == split)
     if published is None or not parts or "queries" in options:
         return []
@@ -198,7 +198,7 @@ def _differences(
 
 
 def _unreadable(paths: Sequence[pathlib.Path], *, quiet: bool) -> list[str]:
-    """Decode all images, and say which cannot be read."""
+    """Decode all images, and report which cannot be read."""
     readable = readable_images(paths, quiet=quiet).tolist()
     wrong = [str(path) for path, whole in zip(paths, readable, strict=True) if not whole]
     return [f"found {len(wrong)} unreadable images: {few(wrong)}"] if wrong else []

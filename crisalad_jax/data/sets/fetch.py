@@ -1,4 +1,4 @@
-"""Download a public data set, and lay it out as `evaluate` and `train` read it."""
+"""Download a public data set, and arrange it as `evaluate` and `train` read it."""
 
 import os
 import pathlib
@@ -19,18 +19,18 @@ from crisalad_jax.utils.files import check_new_folder, read_text, wrap_os_errors
 from crisalad_jax.utils.locks import lock
 
 _ROOM = 2.1
-"""Room on the disk by the size of the download: the archive, and what it holds."""
+"""Disk space needed, as a multiple of the download: the archive and its contents."""
 
 _LAYOUTS = ("images", "train_val")
-"""Folders that belong to a layout, where others around a set do not."""
+"""Folders that belong to a layout, unlike other folders around a set."""
 
 
 @takes(to=PATH)
 def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> pathlib.Path:
     """Download a public data set into a new folder.
 
-    What is on its way is in a folder beside it, as `to`.part, from which the next call resumes. The
-    folder `to` appears when all is there.
+    Unfinished downloads are in a folder next to it, `to`.part, from which the next call resumes.
+    The folder `to` appears when everything is complete.
 
     Args:
         name: of a set in `SETS`.
@@ -41,8 +41,9 @@ def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> 
         The folder.
 
     Raises:
-        InputError: no such set, or one that a person has to ask for; the network is forbidden; the
-            disk has no room; what `download` and `unpack` raise, or the files are not the set's.
+        InputError: no such set, or one that has to be requested from a person; the network is
+            forbidden; the disk lacks space; what `download` and `unpack` raise; or the files are
+            not those of the set.
         ModuleNotFoundError: the set is at a hub whose client, extra `data`, is not installed.
 
     Example:
@@ -73,9 +74,9 @@ def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> 
 
 
 def _check_room(published: PublishedSet, to: pathlib.Path, work: pathlib.Path) -> None:
-    """Check that the disk has room for the files and what they hold, where their size is known.
+    """Check that the disk has room for the files and their contents, if their size is known.
 
-    What an earlier call has brought takes its room already.
+    Files downloaded by an earlier call already take part of that room.
     """
     nearest = next(each for each in to.absolute().parents if each.exists())
     there = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
@@ -111,7 +112,7 @@ def _bring(published: PublishedSet, work: pathlib.Path, *, quiet: bool) -> None:
                 raise InputError(f"{archive}: {words}")
             _open(file, archive, target, quiet=quiet)
         except InputError:
-            archive.unlink(missing_ok=True)  # what is damaged is downloaded again
+            archive.unlink(missing_ok=True)  # download a damaged file again
             raise
 
 
@@ -127,7 +128,7 @@ def _download(
 
 
 def _rsync(address: str, folder: pathlib.Path, *, quiet: bool) -> None:
-    """Copy a folder by the program rsync, which resumes where it was cut off."""
+    """Copy a folder with rsync, which resumes where it was interrupted."""
     require(shutil.which("rsync") is not None, f"{address}: found no program rsync, expected one")
     shown = ["--quiet"] if quiet else ["--info=progress2"]
     command = ["rsync", "-rtz", "--partial", *shown, f"{address}/", str(folder)]
@@ -138,7 +139,7 @@ def _rsync(address: str, folder: pathlib.Path, *, quiet: bool) -> None:
 
 
 def _open(file: SetFile, archive: pathlib.Path, target: pathlib.Path, *, quiet: bool) -> None:
-    """Unpack an archive, and the one in it; or put a file where it belongs."""
+    """Unpack an archive and the one in it, or copy a file to its place."""
     if not is_archive(archive.name):
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(archive, target)
@@ -159,10 +160,10 @@ def _found(folder: pathlib.Path, name: str) -> pathlib.Path:
 
 
 def _arrange(published: PublishedSet, files: pathlib.Path, made: pathlib.Path) -> None:
-    """Lay a set's files out as `evaluate` and `train` read them.
+    """Arrange a set's files as `evaluate` and `train` read them.
 
     Raises:
-        InputError: they are not the set's.
+        InputError: they are not those of the set.
     """
     if published.pairs:
         moves = _pairs(published, files)
@@ -174,14 +175,14 @@ def _arrange(published: PublishedSet, files: pathlib.Path, made: pathlib.Path) -
             os.replace(_found(top, old), top / new)
         os.replace(top, made)
         return
-    for source, name in list(moves):  # all are found before any is moved
+    for source, name in list(moves):  # find all before moving any
         target = made / "images" / "test" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(source, target)
 
 
 def _top(folder: pathlib.Path) -> pathlib.Path:
-    """Return the folder that holds a set: archives have one around it, or none."""
+    """Return the folder that holds a set, below any outer folders of its archive."""
     while True:
         there = [path for path in folder.iterdir() if not path.name.startswith((".", "__MACOSX"))]
         if len(there) != 1 or not there[0].is_dir() or there[0].name in _LAYOUTS:
@@ -190,7 +191,7 @@ def _top(folder: pathlib.Path) -> pathlib.Path:
 
 
 def _pairs(published: PublishedSet, files: pathlib.Path) -> Iterator[tuple[pathlib.Path, str]]:
-    """Yield the images of a set of pairs, and their names: placeholders 1 km apart."""
+    """Yield the images of a set of pairs, and their new names: placeholder positions 1 km apart."""
     sides = {
         side: {path.stem: path for path in list_images(_found(files, folder))}
         for side, folder in published.pairs.items()
@@ -208,7 +209,7 @@ def _pairs(published: PublishedSet, files: pathlib.Path) -> Iterator[tuple[pathl
 
 
 def _frames(published: PublishedSet, files: pathlib.Path) -> Iterator[tuple[pathlib.Path, str]]:
-    """Yield the listed frames of two rides, and their names: so many metres apart."""
+    """Yield the listed frames of two rides, and their new names: positions `metres` apart."""
     how = published.frames
     lines = read_text(files / how["names"], "a list of frames").split()
     names = [line.rpartition("/")[2] for line in lines]

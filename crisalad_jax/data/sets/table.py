@@ -1,4 +1,4 @@
-"""The table of public data sets: what sets.toml says of each."""
+"""The table of public data sets, read from sets.toml."""
 
 import dataclasses
 import difflib
@@ -10,7 +10,7 @@ from typing import Any, Literal
 from crisalad_jax.utils.errors import InputError
 
 Host = Literal["http", "huggingface", "kaggle", "rsync", "google-drive", "form", "request"]
-"""Where a set is: an address that needs nobody, a hub, or a person to ask."""
+"""Where a set is: an open address, a hub, or a person to ask."""
 FETCHED: tuple[Host, ...] = ("http", "huggingface", "kaggle", "rsync")
 """Hosts that a program may download from."""
 
@@ -20,15 +20,15 @@ class SetFile:
     """A file of a set."""
 
     address: str
-    """Address, or a name as OWNER/NAME at a hub."""
+    """Address, or OWNER/NAME at a hub."""
     file: str = ""
-    """Path at the hub; of an address, its name where the address does not end in it."""
+    """Path at the hub; for an address, the file's name if the address lacks it."""
     sha256: str | None = None
-    """SHA-256 of the file; None where nobody publishes it."""
+    """SHA-256 of the file; None if not published."""
     into: str = ""
-    """Where it is unpacked, or put where it is no archive."""
+    """Where it is unpacked, or copied if not an archive."""
     inside: str = ""
-    """An archive in it, which holds the images."""
+    """An archive in it that holds the images."""
 
     @property
     def name(self) -> str:
@@ -38,15 +38,15 @@ class SetFile:
 
 @dataclasses.dataclass(frozen=True)
 class SetPart:
-    """What is published of a part of a set."""
+    """What is published about a part of a set."""
 
     name: str
     database: int | None = None
-    """Number of images; None where it is not known."""
+    """Number of images; None if unknown."""
     queries: int | None = None
     printed: str = ""
-    """A regular expression of the beginning of its name, as `open_benchmark` gives it: where other
-    sets have the same counts, or none are known."""
+    """A regular expression for the beginning of its name by `open_benchmark`, if other sets have
+    the same counts, or none are known."""
 
     @property
     def words(self) -> str:
@@ -68,23 +68,23 @@ class PublishedSet:
     command: str
     """Command that reads it, for a folder DIR."""
     sources: tuple[str, ...]
-    """Where these facts are from."""
+    """Sources of these facts."""
     files: tuple[SetFile, ...] = ()
     gigabytes: float | None = None
-    """Size of the files as they are downloaded; None where it is not known."""
+    """Size of the download; None if unknown."""
     licence: str | None = None
-    """Licence or terms; None where they are not known."""
+    """Licence or terms; None if unknown."""
     ask: str = "nobody"
     """Whom a user has to ask."""
     steps: tuple[str, ...] = ()
-    """What a user does by hand."""
+    """Steps to do by hand."""
     parts: tuple[SetPart, ...] = ()
     cities: tuple[str, ...] = ()
     """Cities of a set of training places."""
     renamed: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Files that have another name where `evaluate` reads them."""
+    """Files that are renamed for `evaluate`: old name -> new."""
     pairs: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Folders of the database and the queries, in which images of one number show one place."""
+    """Folders of database and queries; images with the same number show the same place."""
     frames: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Folders of the database and the queries, the list of their frames, and the metres between
     two."""
@@ -96,7 +96,7 @@ class PublishedSet:
         return self.host in FETCHED
 
     def by_hand(self, folder: str) -> list[str]:
-        """List what a user does by hand, for a folder."""
+        """List the steps to do by hand, for a folder."""
         checked = f"crisalad data check DIR --set {self.name}"
         return [step.replace("DIR", folder) for step in (*self.steps, checked, self.command)]
 
@@ -120,10 +120,10 @@ SETS: dict[str, PublishedSet] = {each.name: each for each in _read()}
 
 
 def find_set(name: str) -> PublishedSet:
-    """Look a public data set up.
+    """Look up a public data set.
 
     Raises:
-        InputError: there is no such set; the message has the nearest names.
+        InputError: there is no such set; the message lists the nearest names.
 
     Example:
         >>> find_set("amstertime").parts[0].queries

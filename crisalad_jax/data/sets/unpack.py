@@ -1,4 +1,4 @@
-"""Unpack archives that others made, by Python's own filters: nothing leads out of the folder."""
+"""Unpack untrusted archives with Python's own filters: nothing is written outside the folder."""
 
 import contextlib
 import os
@@ -16,7 +16,7 @@ _ZIP, _TAR = (".zip",), (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
 
 
 def is_archive(name: str) -> bool:
-    """Return whether a file of this name is unpacked.
+    """Return whether a name is that of an archive to unpack.
 
     Example:
         >>> is_archive("summer.tar.gz"), is_archive("names.txt")
@@ -28,17 +28,17 @@ def is_archive(name: str) -> bool:
 def unpack(archive: pathlib.Path, folder: pathlib.Path, *, quiet: bool = False) -> None:
     """Unpack a zip or tar archive into a folder.
 
-    A tar is filtered as `tarfile.data_filter` does: devices are refused, and names and links that
-    lead out of the folder. A zip has files and folders alone, whose names are cut to be inside.
+    A tar is filtered by `tarfile.data_filter`, which refuses devices, and names and links that lead
+    out of the folder. A zip has only files and folders, whose names are cut to stay inside.
 
     Args:
         archive: the archive.
-        folder: where to; it may exist.
+        folder: the folder to unpack into; it may exist.
         quiet: whether to show no progress bar.
 
     Raises:
-        InputError: it is damaged, holds what its filter refuses, or more than the disk has room
-            for; or the disk is full.
+        InputError: it is damaged, contains something that the filter refuses, or does not fit on
+            the disk; or the disk is full.
     """
     with archive.open("rb") as file:
         if is_html(file.read(512)):
@@ -68,7 +68,7 @@ def _unpack_zip(archive: pathlib.Path, folder: pathlib.Path, quiet: bool) -> Non
 
 
 def _unpack_tar(archive: pathlib.Path, folder: pathlib.Path, quiet: bool) -> None:
-    # The sizes of a compressed tar are known after reading it all.
+    # The sizes in a compressed tar are known only after reading all of it.
     total = os.path.getsize(archive)
     with tarfile.open(archive, "r|*") as opened, _bar(archive, folder, total, quiet) as bar:
         for info in opened:
@@ -79,7 +79,7 @@ def _unpack_tar(archive: pathlib.Path, folder: pathlib.Path, quiet: bool) -> Non
 def _bar(
     archive: pathlib.Path, folder: pathlib.Path, size: int, quiet: bool
 ) -> contextlib.AbstractContextManager[Bar]:
-    """Check that the disk has room, and show the progress of so many bytes."""
+    """Check that the disk has room for `size` bytes, and return their progress bar."""
     free = shutil.disk_usage(folder).free
     if size > free:
         raise InputError(

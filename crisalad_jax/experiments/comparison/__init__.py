@@ -1,4 +1,4 @@
-"""Methods side by side: trained or loaded, evaluated alike, tabled as the paper's Tables 1 to 3."""
+"""Comparison of methods, trained or loaded, evaluated the same way: the paper's Tables 1 to 3."""
 
 from crisalad_jax.experiments.comparison.costs import AdapterCost as AdapterCost
 from crisalad_jax.experiments.comparison.costs import adapter_costs as adapter_costs

@@ -1,4 +1,4 @@
-"""What models cost: their speed, timed in turns under the same load, and the paper's Table 3."""
+"""Costs of models: their speed, timed in turns under the same load, and the paper's Table 3."""
 
 import dataclasses
 import functools
@@ -19,15 +19,15 @@ from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
 
 _ROUNDS = 5
-"""Number of turns of each."""
+"""Number of turns per contender."""
 _CALLS = 3
-"""Number of calls of each in a round; their median counts."""
+"""Number of calls per contender in a round; their median counts."""
 _LONG = 3.0
-"""Seconds of a call that is made once in a round: a few of it vary less than many short ones."""
+"""Seconds from which a call is made once in a round: long calls vary less than short ones."""
 
 
 class Spread(NamedTuple):
-    """What repeats of a measurement range over."""
+    """Median and range of repeated measurements."""
 
     median: float
     least: float
@@ -35,7 +35,7 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Spread | None":
-        """Summarise values; None of none."""
+        """Summarise values; None if there are none."""
         return cls(statistics.median(values), min(values), max(values)) if values else None
 
 
@@ -47,13 +47,13 @@ def race(
 ) -> dict[str, list[float]]:
     """Time calls in turns; each call does all of its work and waits for it.
 
-    The first call of each, which compiles, does not count, nor does the first of each turn. A call
-    of `_LONG` and longer is then made once, any other `_CALLS` times. A contender makes its call
-    for a turn and drops it: one model is in memory at a time. A progress bar counts the turns,
-    unless `quiet`.
+    The first call of each contender, which compiles, does not count, nor does the first of each
+    turn. A call of `_LONG` or longer is then made once, any other `_CALLS` times. A contender makes
+    its call for a turn and then drops it, so that one model is in memory at a time. A progress bar
+    counts the turns, unless `quiet`.
 
     Returns:
-        Seconds of a call by name, the median of each round.
+        Seconds per call by name, the median of each round.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     with progress_bar("speed", (1 + rounds) * len(contenders), "turns", quiet=quiet) as bar:
@@ -71,7 +71,7 @@ def race(
 
 
 def ratios(rounds: Mapping[str, Sequence[float]], name: str, than: str) -> list[float]:
-    """Compare the times of two calls: a ratio of each round, both times under the same load."""
+    """Compare the times of two calls: one ratio per round, both times under the same load."""
     pairs = zip(rounds[name], rounds[than], strict=True)
     return [ours / theirs for ours, theirs in pairs]
 
@@ -83,7 +83,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def machine() -> str:
-    """Name the device that is measured on, in a few words."""
+    """Return a short name of the device that is measured on."""
     device = jax.devices()[0]
     if device.platform == "cpu":
         return f"{usable_cores()} CPU cores"
@@ -95,18 +95,18 @@ class AdapterCost(NamedTuple):
 
     adapter: str
     paper_parameters: int | None
-    """Number of parameters as the paper counts them: docs/comparison.md; None of adapters that it
-    does not have."""
+    """Number of parameters as the paper counts them: docs/comparison.md; None for adapters that it
+    lacks."""
     parameters: int
     """Number of parameters of one adapter here, with batch norms' running statistics."""
     paper_macs: int | None
     macs: int
-    """Multiply-accumulates that an image really takes more in a block."""
+    """Multiply-accumulates that an adapter really adds to a block, per image."""
     time: Spread | None
-    """Time of a training step's block over one without adapter, over the rounds; None where it was
+    """Time of a block in a training step, relative to one without adapter, over the rounds; None if
     not measured."""
     memory: float | None
-    """Memory of the same over that of a block without adapter, as the compiler counts it."""
+    """Memory of the same, relative to a block without adapter, as the compiler counts it."""
 
 
 _PAPER_PARAMETERS: Mapping[str, int] = {
@@ -114,11 +114,11 @@ _PAPER_PARAMETERS: Mapping[str, int] = {
     "multi-resolution": 761_472,
     "depthwise": 741_504,
 }
-"""By the count that docs/comparison.md explains."""
+"""Counted as docs/comparison.md explains."""
 
 
 def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
-    """Make what `race` takes, to time a block's training with each adapter on four images."""
+    """Make the contenders for `race` that train a block with each adapter on four images."""
 
     def ready(name: str) -> Callable[[], Any]:
         inputs = _stack_and_tokens(name)
@@ -128,7 +128,7 @@ def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
 
 
 def adapter_memory(names: Iterable[str]) -> dict[str, int]:
-    """Return the bytes of a block's training with each of these adapters, on four images."""
+    """Return the bytes that training a block on four images takes, with each of these adapters."""
     analyses = {name: _block_program(name).memory_analysis() for name in names}
     return {name: each.temp_size_in_bytes for name, each in analyses.items() if each is not None}
 
@@ -136,10 +136,10 @@ def adapter_memory(names: Iterable[str]) -> dict[str, int]:
 def adapter_costs(
     seconds: Mapping[str, Sequence[float]], memory: Mapping[str, int]
 ) -> list[AdapterCost]:
-    """Compute Table 3, of one adapter at the paper's size, with rows for all other adapters.
+    """Compute Table 3, for one adapter at the paper's size, with rows for all other adapters.
 
     Args:
-        seconds: what `race` returns of `adapter_calls`; empty where nothing was measured.
+        seconds: what `race` returns for `adapter_calls`; empty if nothing was measured.
         memory: what `adapter_memory` returns, or empty.
     """
     costs = []

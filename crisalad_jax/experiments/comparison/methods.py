@@ -29,14 +29,14 @@ from crisalad_jax.utils.output import warn
 
 
 class ComparedMethod(NamedTuple):
-    """A line of the table of `crisalad compare`."""
+    """A line in the table of `crisalad compare`."""
 
     title: str
     """Name of the method as its authors write it."""
     recipe: str
     """Name that `recipe` looks up; methods of one recipe share its runs."""
     rerank: str | None = None
-    """Second stage that re-ranks the first retrievals; None has none."""
+    """Second stage that re-ranks the first retrievals, if any."""
 
 
 METHODS: Mapping[str, ComparedMethod] = {
@@ -58,8 +58,8 @@ METHODS: Mapping[str, ComparedMethod] = {
     "crisalad": ComparedMethod("CriSALAD", "crisalad"),
     "boq": ComparedMethod("BoQ", "boq"),
 }
-"""Methods in the order of Table 1. Those with a + have the head of a method whose own backbone is
-another, on CriSALAD's backbone and with its training. Other names are recipes or parts, without a
+"""Methods in the order of Table 1. Those with a + have the head of a method with another backbone,
+on CriSALAD's backbone and with CriSALAD's training. Other names are recipes or parts, without a
 second stage."""
 
 
@@ -67,13 +67,13 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
     """Look up a method to compare.
 
     Args:
-        name: of `METHODS`, or what `recipe` looks up: a recipe, or RECIPE+PART. A part alone
-            stands for crisalad+PART.
+        name: one of `METHODS`, or what `recipe` looks up: a recipe, or RECIPE+PART. A PART by
+            itself means crisalad+PART.
         preset: the size of the models.
         what: what messages call the name.
 
     Returns:
-        The method; of a recipe its name is the title.
+        The method; for a recipe, the title is its name.
 
     Raises:
         InputError: there is no such method, recipe or part.
@@ -102,9 +102,9 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
 
 
 def is_method(name: str) -> bool:
-    """Return whether a name is a method's or a recipe's, or spells out RECIPE+PART or KIND:NAME.
+    """Return whether a name is a method's or a recipe's, or has the form RECIPE+PART or KIND:NAME.
 
-    A part's name alone is not: with weights it may name any model.
+    A part's name by itself does not count: with weights it may name any model.
 
     Example:
         >>> is_method("salad"), is_method("crisalad+gem"), is_method("megaloc")
@@ -117,7 +117,7 @@ def is_method(name: str) -> bool:
 
 
 def split_second_stage(name: str) -> tuple[str, str | None]:
-    """Split the name of a model and its second stage; after a recipe's name + stands for a part.
+    """Split a name into model and second stage; after a recipe's name, + adds a part instead.
 
     Example:
         >>> split_second_stage("fol-large+fol"), split_second_stage("crisalad+transvpr")
@@ -133,7 +133,7 @@ def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfi
     Args:
         name: what `recipe` looks up.
         preset: the size of the model.
-        from_nothing: whether training starts from random weights, as `from_scratch` has it.
+        from_nothing: whether training starts from random weights; see `from_scratch`.
 
     Returns:
         The configuration.
@@ -150,7 +150,7 @@ def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfi
         return config
     scratch = from_scratch(config)
     part = None if name in RECIPES else find_part(split_name(name)[1], preset)
-    # It is what is compared, and `from_scratch` has set its own.
+    # The part is what is compared, and `from_scratch` has replaced it.
     is_replaced = isinstance(part, Augmentation | Optimiser | Schedule)
     return with_part(scratch, part) if is_replaced else scratch
 
@@ -164,7 +164,7 @@ class Ablation(NamedTuple):
     schedule: Literal["linear", "step"] = "linear"
 
     def training(self, preset: str, *, from_nothing: bool) -> TrainConfig:
-        """Make the paper's recipe with these settings, or from nothing that of `scratch`."""
+        """Make the paper's recipe, or for random weights that of `scratch`, with these settings."""
         config, rate = recipe(preset, f"crisalad+adapter:{self.adapter}"), self.learning_rate
         if not self.encoder:
             model = dataclasses.replace(config.model, cross_image="none")
@@ -178,7 +178,7 @@ class Ablation(NamedTuple):
         return dataclasses.replace(config, optimiser=optimiser)
 
     def words(self, training: TrainConfig) -> str:
-        """Say what the row changes, of CriSALAD itself its settings; `training` is its recipe."""
+        """Describe what the row changes, or CriSALAD's own settings; `training` is its recipe."""
         words = (
             f"adapter {self.adapter}",
             f"cross-image encoder {'yes' if self.encoder else 'no'}",
@@ -199,20 +199,20 @@ ABLATIONS: Mapping[str, Ablation] = {
     "no-encoder": Ablation(encoder=False),
     "no-encoder-step": Ablation(encoder=False, schedule="step"),
 }
-"""The paper's rows, and one without any adapter, which the paper lacks. Its last row, printed with
-the step schedule, is also here with the linear one, which changes a single part."""
+"""The paper's rows, and one without any adapter, which the paper lacks. The paper's last row, with
+the step schedule, is also here with the linear one, so that a single part changes."""
 
 
 _FLAG = re.compile(
     r"""\s*(?:--)?([\w.-]+)\s*=\s*(?=[^\s,])((?:[^,"']|"[^"]*"|'[^']*')+?)\s*(?:,|$)"""
 )
-"""A flag with its value, up to a comma that is in no quotes."""
+"""A flag with its value, up to an unquoted comma."""
 _FIXED = (
     *("seed", "preset", "mining.kind", "patience", "validate-every", "validation-size"),
     *("monitor", "save-top-k"),
 )
 """Flags of `train` that are the same for all rows: a comparison has its own seeds and preset,
-trains on places, and validates nothing."""
+trains on places, and does not validate."""
 
 
 class AblationRow(NamedTuple):
@@ -230,7 +230,7 @@ class AblationRow(NamedTuple):
         return ", ".join(f"{flag}={value}" for flag, value in (*base, *self.flags))
 
     def sets(self, flag: str) -> bool:
-        """Return whether a flag, or one that begins like that, is the row's own."""
+        """Return whether the row sets a flag, or one that starts with it."""
         return any(own.startswith(flag) for own, _ in self.flags)
 
     def training(self, preset: str, *, from_nothing: bool) -> TrainConfig:
@@ -243,7 +243,7 @@ class AblationRow(NamedTuple):
         return self.changed(method_training(found, preset, from_nothing=from_nothing), preset)
 
     def changed(self, config: TrainConfig, preset: str) -> TrainConfig:
-        """Put the row's changes into a configuration; raises as `training`."""
+        """Apply the row's changes to a configuration; raises what `training` raises."""
         pairs = ((f"--{flag}", *shlex.split(value)) for flag, value in self.flags)
         arguments = [word for words in pairs for word in words]
         return parse_changes(config, arguments, preset, f"--row {self.name}")
@@ -260,10 +260,10 @@ def parse_row(text: str) -> AblationRow:
         text: the row.
 
     Returns:
-        The row; flags and values are checked where its configuration is made.
+        The row; flags and values are checked when its configuration is made.
 
     Raises:
-        InputError: the text has another shape, or a flag that is the same for all rows.
+        InputError: the text has another form, or a flag that is the same for all rows.
 
     Example:
         >>> parse_row("flat: recipe=salad, optimiser.learning_rate=1e-5, image_size=224 224").words
@@ -283,6 +283,6 @@ def parse_row(text: str) -> AblationRow:
             "all rows of a comparison"
         )
     base = flags.pop("recipe", "crisalad")
-    # As `train` has it, for the size is wanted often.
+    # A short form, as in `train`, since the size is often set.
     short = {"image-size": "model.image-size"}
     return AblationRow(name, base, tuple((short.get(flag, flag), flags[flag]) for flag in flags))

@@ -53,7 +53,7 @@ _VIEWS = 4
 @with_field_docs
 @dataclasses.dataclass(frozen=True)
 class ComparisonConfig:
-    """Everything that decides a comparison's results; `config.json` in its folder.
+    """Everything that decides a comparison's results; stored in its folder as `config.json`.
 
     Example:
         >>> rows = ("gem: model.aggregator=gem",)
@@ -65,28 +65,28 @@ class ComparisonConfig:
     names: tuple[str, ...]
     """Names of `METHODS`, `ABLATIONS`, recipes and parts, and any others that `weights` has."""
     test: tuple[str, ...]
-    """Evaluation sets, of any layout that `open_benchmark` knows."""
+    """Evaluation sets, in any layout that `open_benchmark` reads."""
     train: str | None = None
     """Training set, in any layout that `read_places` reads."""
     weights: tuple[str, ...] = ()
     """Weights of methods that are not trained here, as NAME=FILE, or the NAME of a published model.
-    A name that is not a method's is a line of its own, whatever model the file holds. Such a name
-    may end in + and a second stage, as in fol-large+fol."""
+    A name that is not a method's adds its own line, whatever model the file holds, and may end in +
+    and a second stage, as in fol-large+fol."""
     backbone: str | None = None
-    """Backbone that training starts from; None trains from nothing, by the recipe `scratch`."""
+    """Backbone that training starts from; None trains from random weights, as in `scratch`."""
     preset: str = "b14"
     epochs: PositiveInt | None = None
     """Number of epochs; None is the recipe's, or `EPOCHS` from nothing."""
     image_size: tuple[int, int] | None = None
     resize: tuple[str, ...] = ()
-    """Words that change how images are resized, as `ModelConfig.resized` takes them."""
+    """Changes to how images are resized, as `ModelConfig.resized` takes them."""
     batch_size: PositiveInt = 16
     """Number of images described together."""
     on_bad_image: OnBadImage = "stop"
-    """What to do at an unreadable image. "skip": training masks it out, and the evaluation sets are
-    compared on without it; each call reads all of their images to find it."""
+    """What to do with unreadable images. "skip": training masks them out, and evaluation sets leave
+    them out; each call reads all images of these sets to find them."""
     grouping: str = "single"
-    """Groupings between commas; a method without a cross-image encoder needs only one."""
+    """Comma-separated groupings; a method without a cross-image encoder needs one."""
     rerank: int = 20
     """Number of first retrievals that methods with a second stage re-rank."""
     seeds: PositiveInt = 3
@@ -95,10 +95,10 @@ class ComparisonConfig:
     """Custom rows of an ablation, as `parse_row` reads them."""
     reference: str | None = None
     """Name that differences, speeds and training times are relative to; None is crisalad, or the
-    first where that is not compared."""
+    first if that is not compared."""
 
     def __post_init__(self) -> None:
-        """Check the types, the ranges, and that nothing comes twice; `prepare` looks names up."""
+        """Check types and ranges, and that nothing is repeated; `prepare` looks names up."""
         check_types(self)
         parse_groupings(self.grouping.split(","))
         _check_distinct(self.flag, self.lines, file_name)
@@ -111,7 +111,7 @@ class ComparisonConfig:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Names of all that is compared: `names`, then the custom rows."""
+        """Names of everything that is compared: `names`, then the custom rows."""
         return (*self.names, *(parse_row(text).name for text in self.rows))
 
     @property
@@ -131,7 +131,7 @@ class ComparisonConfig:
 
 
 def _check_distinct(flag: str, values: Sequence[str], key: Callable[[str], str]) -> None:
-    """Check that there are values, and that no two are for the same folder."""
+    """Check that there are values, and that no two share a folder."""
     if not values or len(set(map(key, values))) < len(values):
         raise InputError(
             f"{flag}: found {', '.join(values) or 'none'}, expected at least one, and each once, "
@@ -140,7 +140,7 @@ def _check_distinct(flag: str, values: Sequence[str], key: Callable[[str], str])
 
 
 def file_name(name: str) -> str:
-    """Make a folder's name of a method's: the colon of KIND:NAME is not allowed everywhere.
+    """Make a folder name from a method's name: the colon of KIND:NAME is not allowed everywhere.
 
     Example:
         >>> file_name("step:newton")
@@ -150,7 +150,7 @@ def file_name(name: str) -> str:
 
 
 def models_of(weights: Iterable[str]) -> tuple[str, ...]:
-    """Return the names in NAME=FILE, or NAME alone, that are no method's.
+    """Return the names in NAME=FILE, or in NAME only, that are not a method's.
 
     Example:
         >>> models_of(["megaloc", "ours=run/best.safetensors", "salad=salad.safetensors"])
@@ -164,8 +164,8 @@ def names_to_compare(methods: Sequence[str] | None, weights: Sequence[str]) -> t
     """Return the lines of a comparison: the methods, and the models that weights add.
 
     Args:
-        methods: names of methods. None stands for those of `weights`, if one of them is no
-            method's, and else for all of `METHODS`.
+        methods: names of methods. None means those of `weights` if one of them is not a
+            method's, and otherwise all of `METHODS`.
         weights: NAME=FILE, or the name of a published model.
 
     Returns:
@@ -183,7 +183,7 @@ def names_to_compare(methods: Sequence[str] | None, weights: Sequence[str]) -> t
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One line of the table, with all that its runs need."""
+    """One line of the table, with everything that its runs need."""
 
     name: str
     labels: tuple[str, ...]
@@ -191,7 +191,7 @@ class Variant:
     run: str
     """Name of the run that makes its model, which other variants may share."""
     training: TrainConfig
-    """Configuration of its training with seed 0; of a model from a file the model alone counts."""
+    """Configuration of its training with seed 0; for a model from a file only the model counts."""
     rerank: str | None = None
     """Second stage, as `--rerank` of `evaluate` reads it."""
     row: AblationRow | None = None
@@ -202,9 +202,9 @@ class Variant:
     """Training set, if it is trained here or has a vocabulary; it includes small places if its loss
     regroups the images."""
     steps_per_epoch: int = 0
-    """Steps of an epoch of its training; 0 of a model from a file."""
+    """Training steps per epoch; 0 for a model from a file."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Everything that decides its model, as JSON values: digests stand for files and sets."""
+    """Everything that decides its model, as JSON values, with digests for files and sets."""
 
     @property
     def model(self) -> ModelConfig:
@@ -213,13 +213,13 @@ class Variant:
 
     @property
     def trains(self) -> bool:
-        """Whether the variant is trained here: not loaded from a file, nor a vocabulary alone."""
+        """Whether the variant is trained here: not loaded from a file, nor only a vocabulary."""
         return self.weights is None and self.model.aggregator.trainable
 
 
 @brief
 class Prepared(NamedTuple):
-    """A comparison whose parts fit each other."""
+    """A comparison whose parts fit together."""
 
     config: ComparisonConfig
     variants: list[Variant]
@@ -233,15 +233,15 @@ def prepare(config: ComparisonConfig, *, quiet: bool = True) -> Prepared:
 
     Args:
         config: what to compare.
-        quiet: no progress bar where all images are read.
+        quiet: no progress bar while all images are read.
 
     Returns:
         The comparison.
 
     Raises:
         InputError: a file cannot be read or holds another method's weights; something has to be
-            trained or clustered without a training set; a method does not fit the images or its
-            parts each other; more images would be re-ranked than a set has.
+            trained or clustered without a training set; a method does not fit the images, or its
+            parts do not fit together; more images would be re-ranked than a set has.
     """
     files = _weights(config)
     benchmarks, left_out = _open_sets(config, quiet=quiet)
@@ -281,7 +281,7 @@ def _open_sets(config: ComparisonConfig, *, quiet: bool) -> tuple[list[Benchmark
     benchmarks, left_out = [], []
     for path in config.test:
         benchmark = readable = open_benchmark(path, on_bad_image=config.on_bad_image)
-        benchmark.ground_truth()  # raises where there is none
+        benchmark.ground_truth()  # raises if there is none
         if config.on_bad_image == "skip":
             readable = leave_out_unreadable(benchmark, quiet=quiet)
         queries = len(benchmark.queries) - len(readable.queries)
@@ -332,7 +332,7 @@ def _draft(config: ComparisonConfig, name: str, files: Mapping[str, pathlib.Path
 
 
 def _check_method(name: str, wanted: ModelConfig, found: ModelConfig, path: pathlib.Path) -> None:
-    """Check that a file's model is one of a method."""
+    """Check that a file's model belongs to a method."""
 
     def words(model: ModelConfig) -> str:
         adapter = getattr(getattr(model.backbone, "adapter", None), "part_name", "none")
@@ -349,7 +349,7 @@ def _check_method(name: str, wanted: ModelConfig, found: ModelConfig, path: path
 
 
 def _fitted(config: ComparisonConfig, variants: list[Variant]) -> list[Variant]:
-    """Fit the recipes of what is made here to the training set; what a row sets stays as it is."""
+    """Fit the recipes of models made here to the training set; what a row sets is not changed."""
     # A vocabulary needs training images too, although nothing trains.
     need = dict.fromkeys(variant.run for variant in variants if variant.weights is None)
     if not need:
@@ -390,7 +390,7 @@ def _of_size(
 ) -> TrainConfig:
     """Fit a recipe to a training set of that many places, so that it can fill its batches.
 
-    From random weights all methods have the same number of images in a batch, and of steps, and a
+    From random weights, all methods have the same number of images per batch and of steps, and a
     classification loss takes a small set's places as classes, all in one group.
     """
     loss, grouping = training.loss, training.loss.kind.grouping
@@ -420,7 +420,7 @@ def _of_size(
 def _settings(
     config: ComparisonConfig, variant: Variant, digest: Callable[[Any], str]
 ) -> dict[str, Any]:
-    """Note what decides a variant's model, with digests of what the configuration only names."""
+    """Record what decides a variant's model, with digests of what the configuration only names."""
     if variant.weights is not None:
         return {"weights": digest(variant.weights), "model": to_plain(variant.model)}
     assert variant.places is not None
@@ -437,7 +437,7 @@ def _settings(
 
 
 def short_names(benchmarks: list[Benchmark]) -> list[str]:
-    """Make a short name for each set, no two alike."""
+    """Make a unique short name for each set."""
     short = [benchmark.name.partition(" (")[0].partition("/")[0] for benchmark in benchmarks]
     return [
         name if short.count(name) == 1 else f"{name} {number}"

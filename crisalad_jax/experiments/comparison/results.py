@@ -1,4 +1,4 @@
-"""The results of a comparison: a file for each run, and their summary, a row for each method."""
+"""The results of a comparison: a file for each run, and a summary with a row for each method."""
 
 import dataclasses
 import itertools
@@ -48,17 +48,17 @@ def read_result(path: pathlib.Path) -> dict[str, Any]:
 
 @dataclasses.dataclass
 class RunResult:
-    """All that a run has come to: `result.json` in its folder."""
+    """The results of a run so far: `result.json` in its folder."""
 
     settings: Mapping[str, Any]
-    """What decided its model, as `Variant.settings`."""
+    """What decided its model; see `Variant.settings`."""
     training: dict[str, Any] | None = None
     """Steps and times of its training, once that is finished."""
     ranks: dict[str, dict[str, list[int]]] = dataclasses.field(default_factory=dict)
-    """Evaluation -> grouping -> rank of each query's first right retrieval, from 1; 0 for none."""
+    """Evaluation -> grouping -> rank of each query's first correct retrieval, from 1; 0 if none."""
 
     def write(self, folder: pathlib.Path) -> None:
-        """Write it into the run's folder, whole or not at all."""
+        """Write it into the run's folder atomically."""
         write_json(folder / "result.json", dataclasses.asdict(self))
 
 
@@ -66,7 +66,7 @@ class Evaluation(NamedTuple):
     """One of the evaluations of a run."""
 
     key: str
-    """All that its result depends on besides the run's model."""
+    """Everything that its result depends on, except the model."""
     variant: Variant
     benchmark: Benchmark
 
@@ -84,7 +84,7 @@ class Run(NamedTuple):
         return self.evaluations[0].variant
 
     def read(self) -> RunResult:
-        """Read its result, or begin one.
+        """Read its result, or start a new one.
 
         Raises:
             InputError: the file was damaged, or the run was made with other settings.
@@ -110,7 +110,7 @@ class Run(NamedTuple):
 
 
 def runs_of(prepared: Prepared, out: pathlib.Path) -> list[Run]:
-    """List the runs of a comparison: a seed each, and one of a model from a file."""
+    """List the runs of a comparison: one per seed, but only one for a model from a file."""
     config = prepared.config
     how = f"{config.grouping}, batches of {config.batch_size}"
     evaluations: dict[str, list[Evaluation]] = {}
@@ -128,7 +128,7 @@ def runs_of(prepared: Prepared, out: pathlib.Path) -> list[Run]:
 
 
 def _changes(was: Any, now: Any, name: str = "") -> Iterator[str]:
-    """Yield in words where two trees of settings differ."""
+    """Yield descriptions of where two trees of settings differ."""
     if isinstance(was, Mapping) and isinstance(now, Mapping):
         for key in {**was, **now}:
             yield from _changes(was.get(key), now.get(key), f"{name}.{key}" if name else key)
@@ -148,7 +148,7 @@ class Recall(NamedTuple):
     """95 % interval of the mean over the queries: see `metrics.bootstrap_interval`."""
     by_seed: tuple[float, ...]
     difference: Difference | None = None
-    """Difference to the reference; None of the reference itself."""
+    """Difference to the reference; None for the reference itself."""
 
 
 @brief
@@ -164,15 +164,15 @@ class Row(NamedTuple):
     speed: float
     """Number of images described in the time that the reference takes for one."""
     images_per_second: float | None
-    """Speed in images a second; None on a CPU, where it depends on other load."""
+    """Speed in images per second; None on a CPU, where other load changes it."""
     parameters: int
     trained: int | None
     """Number of parameters that were trained; None for a model from a file."""
     training: Spread | None
-    """Training time over the reference's, of each of its runs to each of the reference's; None
-    where one of the two has fewer than two runs that had their device to themselves."""
+    """Training time relative to the reference's, for each pair of their runs; None if either has
+    fewer than two runs that had their device to themselves."""
     training_seconds: Spread | None
-    """Steps times a step's median seconds, of those runs; None of fewer than two."""
+    """Steps times a step's median seconds, for those runs; None for fewer than two."""
 
 
 @brief
@@ -249,7 +249,7 @@ def _rows(
     if variant.trains:
         trained = count_trainable(variant.model, variant.training.trainable)
     for grouping, ranks in _ranks(variant, sets, results[variant.run]).items():
-        # A grouping that the reference lacks is compared with its first.
+        # A grouping that the reference lacks is compared with the reference's first.
         other = theirs.get(grouping, next(iter(theirs.values())))
         recalls = {}
         for name in sets:
@@ -265,7 +265,7 @@ def _rows(
             images_per_second=speed["batch_size"] / batch if speed["absolute"] else None,
             parameters=parameters,
             trained=trained,
-            # Runs are not interleaved: one of the same seed met no more of the same load.
+            # Runs are not interleaved, so those of the same seed did not share the same load.
             training=Spread.of([each / other for each in ours for other in others]),
             training_seconds=Spread.of(ours),
         )
@@ -274,7 +274,7 @@ def _rows(
 def _ranks(
     variant: Variant, sets: Mapping[str, Benchmark], results: Sequence[tuple[Run, RunResult]]
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Collect a variant's (seed, query) ranks of first right retrievals, by grouping and set."""
+    """Collect a variant's (seed, query) ranks of first correct retrievals, by grouping and set."""
     run = results[0][0]
     own = [each.key for each in run.evaluations if each.variant is variant]
     groupings = results[0][1].ranks[own[0]]
@@ -288,9 +288,9 @@ def _ranks(
 
 
 def recall_of(ranks: np.ndarray, k: int, reference: np.ndarray | None = None) -> Recall:
-    """Compute Recall@K of (seed, query) ranks of the first right retrieval, from 1; 0 is none.
+    """Compute Recall@K from (seed, query) ranks of the first correct retrieval, from 1; 0 is none.
 
-    All that is trained here has the same seeds; a model from a file has a single one.
+    Everything trained here has the same seeds; a model from a file has a single one.
     """
     hits = (ranks > 0) & (ranks <= k)
     by_seed = tuple(hits.mean(axis=1).tolist())
@@ -315,7 +315,7 @@ def _training_seconds(results: Sequence[tuple[Run, RunResult]]) -> list[float]:
 
 
 def _notes(prepared: Prepared, reference: Variant, speed: Mapping[str, Any]) -> list[str]:
-    """Say how the numbers came about; docs/comparison.md says more."""
+    """Explain how the numbers were obtained; docs/comparison.md says more."""
     variants, sizes = prepared.variants, {}
     for variant in variants:
         training = variant.training

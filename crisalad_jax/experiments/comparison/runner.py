@@ -70,34 +70,34 @@ def compare(
     say: Say = lambda line: None,
     quiet: bool = False,
 ) -> Summary:
-    """Train or load the methods of a comparison, evaluate them alike, and write the tables.
+    """Train or load the methods of a comparison, evaluate them the same way, and write the tables.
 
-    Everything is checked before any work, as far as it can be. The same call resumes after a kill.
-    It also goes on with a folder that holds a part of the comparison, or more: methods, rows, seeds
-    and sets may be added.
+    As much as possible is checked before any work. The same call resumes after a kill. It also
+    continues in a folder that holds a part of the comparison, or more: methods, rows, seeds and
+    sets may be added.
 
     Args:
         config: what to compare.
-        out: the folder. Besides the runs it holds table.md, table.csv, results.json and the page
-            index.html.
+        out: the folder. In addition to the runs it holds table.md, table.csv, results.json and the
+            page index.html.
         page: a Markdown page that gets the tables too, between its comments <!-- NAME --> and
             <!-- end of NAME -->, where NAME is the name of the folder.
-        jobs: number of runs at once, as tasks of Ray, each with its share of the devices. By
-            default 1; on a cluster one for each GPU, or for each node without any.
-        cluster: Ray's cluster: "local", "auto" or an address, as `cluster.connected` takes it. All
+        jobs: number of runs at once, as Ray tasks, each with its share of the devices. By
+            default 1; on a cluster one per GPU, or one per node if there are no GPUs.
+        cluster: Ray cluster: "local", "auto" or an address, as `cluster.connected` takes it. All
             its nodes read the files of `config`, and write into `out`. None is this machine.
-        say: is given a line at the start and before each run.
-        quiet: whether to show no progress bars.
+        say: called with a line at the start and before each run.
+        quiet: whether to hide progress bars.
 
     Returns:
         The results, as the tables show them.
 
     Raises:
         InputError: what `prepare`, `fit`, `evaluate` and `summarise` raise; the folder holds
-            other files, or a run of the same name with other settings; another process writes into
-            it; the page has no place for the tables; or there is no such cluster, or a node that
+            other files, or a run of the same name with other settings; another process is writing
+            to it; the page has no place for the tables; or there is no such cluster, or a node that
             cannot take part.
-        Interrupted: a signal asked for the end; the same call resumes.
+        Interrupted: a signal asked it to stop; the same call resumes.
     """
     out = pathlib.Path(out)
     name = real_path(out).name
@@ -168,7 +168,7 @@ def _complete(
                 reading=Reading(batch_size=config.batch_size, quiet=True),
             )
             truth = benchmark.ground_truth()
-            # Of a grouping with and without a second stage, the last is the one with it.
+            # For a grouping with and without a second stage, the last result is the one with it.
             result.ranks[key] = {
                 each.grouping: first_right_ranks(each.neighbours, truth).tolist()
                 for each in results
@@ -186,7 +186,7 @@ def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> C
         return load_weights(weights, expected=variant.model)[0]
     training = dataclasses.replace(variant.training, seed=run.seed)
     start = _start(prepared, run, training, quiet)
-    result.write(run.folder)  # the settings, which a resumed training is checked by
+    result.write(run.folder)  # the settings, which a resumed training is checked against
     if not variant.trains:
         save_weights(weights, Model(start, variant.model))
         return start
@@ -220,7 +220,7 @@ def _start(prepared: Prepared, run: Run, training: TrainConfig, quiet: bool) -> 
 
 
 def _measured(prepared: Prepared, runs: Sequence[Run], path: pathlib.Path) -> Any:
-    """Read the times of all models and adapters; None where any of them is missing."""
+    """Read the times of all models and adapters; None if any of them is missing."""
     if not path.exists():
         return None
     record, config = read_result(path), prepared.config
@@ -237,7 +237,7 @@ def _speed(prepared: Prepared, runs: Sequence[Run], quiet: bool) -> dict[str, An
 
     def ready(run: Run) -> Callable[[], Any]:
         params, model = _model(prepared, run, quiet=True), run.variant.model
-        # Of the first set's size, which models that take images at their own size go by.
+        # From the first set: its size counts for models that take images at their own size.
         image = prepare_image(read_pixels(prepared.benchmarks[0].queries[0]), model)
         describer = describer_of(Model(params, model))
         return functools.partial(describe_prepared, describer, [image] * size, size)

@@ -48,7 +48,7 @@ def markdown(summary: Summary) -> str:
 
 
 def put_in_page(page: pathlib.Path, name: str, text: str) -> None:
-    """Put a text between its marks in a page; raises as `files.around`."""
+    """Put a text between its markers in a page; raises what `split_markers` raises."""
     before, after = split_markers(page, name)
     write_text(page, f"{before}\n{text}\n{after}")
 
@@ -117,7 +117,7 @@ def _points(fraction: float) -> str:
 
 
 def costs_of(row: Row) -> dict[str, str]:
-    """Format a row's costs by their headers: times over the reference's on a CPU."""
+    """Format a row's costs by header; on a CPU, times are relative to the reference's."""
     if row.images_per_second is None:
         speed = f"{row.speed:.2f} x"
         training = NOTHING if row.training is None else _ratios(row.training)
@@ -136,16 +136,16 @@ def costs_of(row: Row) -> dict[str, str]:
 
 
 def _ratios(times: Sequence[float]) -> str:
-    """Format the median, the least and the most of ratios."""
+    """Format the median, minimum and maximum of ratios."""
     return "{:.2f} x ({:.2f} to {:.2f})".format(*times)
 
 
 def adapter_cells(cost: AdapterCost) -> dict[str, str]:
-    """Format the cost of an adapter by its headers."""
+    """Format the cost of an adapter by header."""
     paper = parameters = flops = NOTHING
     if cost.paper_macs is not None:
         paper, flops = (f"{count * cost.paper_macs / 1e6:.3f}" for count in (1, 2))
-        # The only figure of the paper that no way of counting gives.
+        # The only figure of the paper that no way of counting reproduces.
         printed = " (printed: 2,356,080)" if cost.adapter == "mlp" else ""
         parameters = f"{cost.paper_parameters:,}{printed}"
     return {
@@ -161,7 +161,7 @@ def adapter_cells(cost: AdapterCost) -> dict[str, str]:
 
 
 def as_json(summary: Summary) -> dict[str, Any]:
-    """Put everything into JSON values; recalls are fractions."""
+    """Convert everything to JSON values; recalls are fractions."""
     names = {name: each.name for name, each in summary.sets.items()}
     return _plain(summary) | {"sets": names}
 

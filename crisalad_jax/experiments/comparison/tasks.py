@@ -1,4 +1,4 @@
-"""The work of a comparison as tasks of Ray, each with its share of the cluster's devices."""
+"""The work of a comparison as Ray tasks, each with its share of the cluster's devices."""
 
 import contextlib
 import math
@@ -23,16 +23,16 @@ _MEMORY = 0.9
 _TRIES = 10
 """Number of times that a task may lose its worker."""
 _PATIENCE = 300.0
-"""Seconds that the tasks have to save their work at an interruption; compiling may take minutes."""
+"""Seconds that tasks have to save their work on an interruption; compiling may take minutes."""
 _JAX = (
     *("jax_platforms", "jax_num_cpu_devices", "jax_compilation_cache_dir"),
     "jax_persistent_cache_min_compile_time_secs",
 )
-"""Settings of JAX that a worker takes from this process, as variables: a run has the same bits."""
+"""JAX settings that workers inherit as environment variables, so that runs have the same bits."""
 
 
 class Share(NamedTuple):
-    """What each task gets of a cluster."""
+    """The share of a cluster that each task gets."""
 
     device: str
     """What it reserves: "GPU", or "CPU" for cores."""
@@ -47,18 +47,18 @@ class Share(NamedTuple):
 def share_of(nodes: Sequence[Mapping[str, float]], jobs: int | None) -> Share:
     """Share the devices of a cluster between tasks.
 
-    GPUs are dealt out, one or more to a task; where there are too few, tasks share them, and their
-    memory. Without GPUs a task reserves cores, but JAX computes on all cores of its node.
+    Each task gets one or more GPUs; if there are too few, tasks share them, and their memory.
+    Without GPUs a task reserves cores, but JAX computes on all cores of its node.
 
     Args:
         nodes: the resources of each node, by Ray's names.
-        jobs: number of tasks at once. None is one for each GPU, or one for each node without any.
+        jobs: number of tasks at once. None is one per GPU, or one per node if there are no GPUs.
 
     Returns:
         The share of each task.
 
     Raises:
-        InputError: no node has any.
+        InputError: no node has a GPU or a CPU.
 
     Example:
         >>> share_of([{"CPU": 16, "GPU": 2}], 4)
@@ -91,8 +91,8 @@ def joined(
     Args:
         address: as `cluster.connected` takes it.
         jobs: as `share_of` takes it.
-        read: files and folders; those that are here every node has to read.
-        write: a folder that every node has to write into.
+        read: files and folders; every node must be able to read those that exist here.
+        write: a folder that every node must be able to write into.
 
     Raises:
         InputError: what `connected` and `check_nodes` raise.
@@ -114,7 +114,7 @@ def joined(
 def in_turn(
     work: Callable[..., Any], shared: tuple[Any, ...], each: Iterable[tuple[Any, ...]] = ((),)
 ) -> list[Any]:
-    """Call a function for each of some arguments, after those that all calls share."""
+    """Call a function with each set of arguments, after those that all calls share."""
     return [work(*shared, *given) for given in each]
 
 
@@ -124,22 +124,22 @@ def in_tasks(
     shared: tuple[Any, ...],
     each: Iterable[tuple[Any, ...]] = ((),),
 ) -> list[Any]:
-    """Do the same by tasks of the cluster; return the results in the order in which they end.
+    """Do the same with tasks of the cluster; return the results in the order in which they finish.
 
-    Arguments are taken from `each` as tasks begin. A task whose worker is lost is begun again. At a
-    signal the tasks get Ctrl-C, and time to save their work; a second signal does not wait for it.
-    An error of one ends the others likewise.
+    Arguments are taken from `each` as tasks start. A task whose worker is lost is started again. On
+    a signal, the tasks get Ctrl-C and time to save their work; a second signal does not wait for
+    it. An error in one task ends the others in the same way.
 
     Raises:
-        InputError: what a call raises as one; or one has lost too many workers.
-        Interrupted: a signal asked for the end.
+        InputError: what a call raises; or a task has lost too many workers.
+        Interrupted: a signal asked it to stop.
     """
     import ray
     from ray.exceptions import RayError, RayTaskError, UnserializableException
 
     task = ray.remote(_carry_out).options(**_options(share))
     here = os.getcwd(), loaded_plugins()
-    reference = [ray.put((work, shared))]  # in a list: a task reads it after its plug-ins
+    reference = [ray.put((work, shared))]  # in a list: a task reads it after loading plug-ins
     waiting, again, lost = iter(each), [], Counter()
     running, results = {}, []
     with defer_signals() as stop:
@@ -181,7 +181,7 @@ def in_tasks(
 
 
 def _options(share: Share) -> dict[str, Any]:
-    """Return Ray's options of a task: what it reserves, and the variables of its process."""
+    """Return the Ray options of a task: what it reserves, and its environment variables."""
     values = {name.upper(): getattr(jax.config, name) for name in _JAX}
     values[MAX_PIXELS] = os.environ[MAX_PIXELS]
     if share.device == "GPU" and share.size < 1:
@@ -200,10 +200,10 @@ def _nothing() -> None:
 def _carry_out(
     folder: str, plugins: Sequence[str], reference: list[Any], given: tuple[Any, ...]
 ) -> tuple[Any, list[str]]:
-    """Carry out a call in a worker; return its result, and its notes."""
+    """Run a call in a worker; return its result and its notes."""
     import ray
 
-    with contextlib.suppress(OSError):  # a node without this folder is given whole paths
+    with contextlib.suppress(OSError):  # a node without this folder gets absolute paths
         os.chdir(folder)
     load_plugins(plugins)
     work, shared = ray.get(reference[0])

@@ -30,8 +30,8 @@ from crisalad_jax.experiments.report.style import (
 from crisalad_jax.retrieval.neighbours import Neighbours
 
 OUTCOMES = ("wrong", "no positive", "right")
-"""What may become of a query: its first retrieval is wrong although another image is right, no
-database image is right, or it is right."""
+"""Possible outcomes of a query: its first retrieval is wrong although another image is correct, no
+database image is correct, or the first retrieval is correct."""
 _DASHES = ("-", "--", ":")
 # Key, title of the panel, and whether to smooth it because batches make it noisy.
 _LOSSES = (
@@ -44,7 +44,7 @@ _TIMES, _LEAST = 10, 1000.0
 _SHARE, _COUNT = 0.02, 5
 _TRUTH = "#d55e00"
 _MANY = 20_000
-"""Number of images above which their marks are pixels in vectors too, for small files."""
+"""Number of images above which marks are rasterised in vector files too, to limit their size."""
 
 
 def recall_curves(
@@ -54,8 +54,8 @@ def recall_curves(
 
     Args:
         curves: name -> K -> fraction of the queries, 0 to 1.
-        title: stands above the picture.
-        wide: whether it is for a page of its own, and not for one that telephones show too.
+        title: title above the picture.
+        wide: whether it is for a page of its own, rather than one that is also read on phones.
 
     Returns:
         The figure.
@@ -86,8 +86,8 @@ def precision_curves(curves: Mapping[str, PrecisionRecall]) -> Picture:
 def training_curves(records: Sequence[Mapping[str, int | float]]) -> Picture:
     """Draw a run: its losses, learning rate and validation recalls against the step.
 
-    A panel is drawn for each that the records hold. Long noisy series are pale under their running
-    mean.
+    Each of these that the records hold gets a panel. Long noisy series are pale, under their
+    running mean.
 
     Args:
         records: the lines of metrics.jsonl, each with "step" and any of "loss",
@@ -152,14 +152,14 @@ def _draw_series(axes: Axes, series: Mapping[int, float], noisy: bool) -> None:
 
 
 def outcomes_of(neighbours: Neighbours, positives: Sequence[Int[np.ndarray, " _"]]) -> np.ndarray:
-    """Return what became of each query, one of `OUTCOMES`, by its first retrieval."""
+    """Return the outcome of each query, one of `OUTCOMES`, by its first retrieval."""
     right = right_retrievals(neighbours.indices[:, :1], positives)[:, 0]
     matched = [len(wanted) > 0 for wanted in positives]
     return np.where(right, "right", np.where(matched, "wrong", "no positive"))
 
 
 class Positions(NamedTuple):
-    """Where images were taken, and which of them are where the others are."""
+    """Where images were taken, and which of these positions are plausible."""
 
     database: Float[np.ndarray, "n axis"]
     queries: Float[np.ndarray, "q axis"]
@@ -172,11 +172,11 @@ class Positions(NamedTuple):
 def find_placed(
     database: Float[np.ndarray, "n axis"], queries: Float[np.ndarray, "q axis"]
 ) -> Positions:
-    """Tell images with a likely position from those with a placeholder, such as (0, 0).
+    """Separate images with a plausible position from those with a placeholder, such as (0, 0).
 
-    An image is out of place if it is ten times farther from the median position than nine tenths
-    of the images, and over a kilometre. Neither is measured by images at (0, 0), nor by those that
-    share one position with many others. A second city with a tenth of the images is in place.
+    An image is out of place if it is over a kilometre from the median position, and over ten times
+    the distance within which nine tenths of the images lie. Images at (0, 0), or sharing a position
+    with many others, do not count in either. A second city with a tenth of the images is in place.
     """
     points = np.concatenate([database, queries])
     _, which, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
@@ -194,11 +194,11 @@ def find_placed(
 def position_map(
     positions: Positions, first: Int[np.ndarray, " q"], outcomes: np.ndarray
 ) -> Picture:
-    """Draw a map in metres, with the same scale on both axes, of the images that are in place.
+    """Draw a map of the images that are in place, in metres, with the same scale on both axes.
 
-    The database is grey. A query is a green dot if its first retrieval is right, or a red cross,
+    The database is grey. A query is a green dot if its first retrieval is correct, or a red cross,
     with a line to the retrieval, if it is wrong. It is a hollow triangle if no database image is
-    right.
+    correct.
 
     Args:
         positions: of all images, in metres.
@@ -253,7 +253,7 @@ def truth_cells(
     """Mark the cells of a similarity map that hold a query and one of its positives.
 
     Args:
-        positives: the database indices that are right for each query.
+        positives: the database indices that are correct for each query.
         database: number of images in the database.
         shape: shape of the similarity map.
     """
@@ -271,14 +271,14 @@ def similarity_matrix(
     outcomes: np.ndarray,
     database: int,
 ) -> Picture:
-    """Draw a similarity map, ground truth tinted, first retrievals as dots.
+    """Draw a similarity map, with tinted ground truth and first retrievals as dots.
 
     Args:
         similarities: the map that `similarity.similarity_map` returns.
-        positives: the database indices that are right for each of the q queries.
-        first: the first retrieval of each query; green where right, red where not.
+        positives: the database indices that are correct for each of the q queries.
+        first: the first retrieval of each query; green if correct, red if not.
         outcomes: what `outcomes_of` returns.
-        database: images in the database.
+        database: number of images in the database.
     """
     queries = len(positives)
     # Cells are square, unless one side would be too narrow to read.

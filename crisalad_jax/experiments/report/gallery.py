@@ -1,4 +1,4 @@
-"""Galleries of queries and what was retrieved for them."""
+"""Galleries of queries and their retrievals."""
 
 import os
 import re
@@ -37,7 +37,7 @@ _WIDTH, _GAP = 1.7, 0.26
 _LINES = 40
 """Largest number of lines between inliers."""
 _BOX = 0xC4
-"""Grey of a picture that is not there."""
+"""Grey level of a missing picture."""
 _NAME = 28
 """Largest number of characters of a name: at 7 points they are as wide as a picture."""
 
@@ -53,30 +53,30 @@ def show_retrievals(
     root: str | os.PathLike[str] | None = None,
     title: str = "",
 ) -> Picture:
-    """Draw queries, one a row, with what was found for them, best first.
+    """Draw queries, one per row, with their retrievals, best first.
 
-    Results of an evaluation are framed green where right and red where wrong, with a mark for
-    readers who cannot tell these. Answers of a map are framed grey: what is right is unknown. Lines
-    join the inliers of a query and its best answer where answers are verified.
+    Results of an evaluation are framed green if correct and red if wrong, with a mark for readers
+    who cannot see the difference. Answers of a map are framed grey, as their correctness is
+    unknown. If answers are verified, lines join the inliers of a query and its best answer.
 
     Args:
         found: answers of `query`, or one of the results of `evaluate`.
-        benchmark: what was evaluated on, for a result.
-        queries: numbers of the queries shown, in their order. None takes half of them right and
-            half wrong where that is known, spread evenly, so that the same input gives the same
+        benchmark: the evaluated benchmark, for a result.
+        queries: numbers of the queries to show, in this order. None takes half of them correct and
+            half wrong if that is known, spread evenly, so that the same input gives the same
             picture.
-        rows: number of queries shown, at most, where none are named.
-        columns: number of retrievals shown for each, at most.
-        root: folder of a map's images; None is where they were. One that is not there is a grey
-            box, and a note says so.
-        title: stands above the picture.
+        rows: maximum number of queries shown if `queries` is None.
+        columns: maximum number of retrievals shown for each.
+        root: folder of a map's images; None for where they were. A missing image is a grey box,
+            with a warning.
+        title: title above the picture.
 
     Returns:
         A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: neither of these; a result without its benchmark, or answers with one; no query,
-            or one that there is not; or an image that cannot be read.
+        InputError: `found` is neither; a result without its benchmark, or answers with one; no
+            query, or a number out of range; or an image that cannot be read.
 
     Example:
         >>> import numpy as np, pathlib
@@ -115,13 +115,13 @@ def write_galleries(
     """Write a gallery of retrievals for each result of an evaluation, gallery_GROUPING.png.
 
     Args:
-        out: the folder, made where it is missing.
-        benchmark: what was evaluated on.
+        out: the folder, created if missing.
+        benchmark: the evaluated benchmark.
         results: what `evaluate` returned.
-        model_name: which weights, for the titles.
+        model_name: name of the weights, for the titles.
 
     Raises:
-        InputError: an image cannot be read, or a picture not be written.
+        InputError: an image cannot be read, or a picture cannot be written.
     """
     for result in results:
         label = re.sub(r"[/:]", "-", result.label).replace(" + ", "_")
@@ -133,7 +133,7 @@ def write_galleries(
 def first_right_ranks(
     neighbours: Neighbours, positives: Sequence[Int[np.ndarray, " _"]]
 ) -> Int[np.ndarray, " q"]:
-    """Find the rank of each query's first right retrieval, from 1; 0 where none is right."""
+    """Find the rank of each query's first correct retrieval, from 1; 0 if none is correct."""
     right = right_retrievals(neighbours.indices, positives)
     return np.where(right.any(axis=1), right.argmax(axis=1) + 1, 0)
 
@@ -148,25 +148,25 @@ def thumbnail(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray,
 
 
 def evenly(queries: Int[np.ndarray, " n"], most: int) -> list[int]:
-    """Choose at most so many queries, evenly spaced from the first to the last."""
+    """Choose at most `most` queries, evenly spaced from the first to the last."""
     places = np.linspace(0, len(queries) - 1, min(most, len(queries))).round().astype(int)
     return queries[places].tolist()
 
 
 def _half_right(right: Bool[np.ndarray, " q"], rows: int) -> list[int]:
-    """Choose right queries, then wrong ones: half each, more of one kind if the other is short."""
+    """Choose correct queries, then wrong ones: half each, more of one if the other is short."""
     good, bad = np.flatnonzero(right), np.flatnonzero(~right)
     good_count = min(len(good), max(rows - rows // 2, rows - len(bad)))
     return evenly(good, good_count) + evenly(bad, rows - good_count)
 
 
 class _Tile(NamedTuple):
-    """A picture of a gallery, with what is below it."""
+    """A picture of a gallery, with the text below it."""
 
     file: Path
     caption: str
     colour: str = INK
-    """Of the caption, and of the frame where it is right or wrong."""
+    """Of the caption, and of the frame if it is correct or wrong."""
     name: str = ""
     joined: tuple[np.ndarray, np.ndarray] | None = None
     """Pixels of inliers in the query's file and in this one."""
@@ -177,11 +177,11 @@ class _Shown(NamedTuple):
 
     pixels: UInt8[np.ndarray, "h w 3"]
     factor: float
-    """Its pixels in one of the file's."""
+    """Its pixels per pixel of the file."""
 
 
 def _captions(found: Answers | GroupingResult, query: int, columns: int) -> Iterator[tuple]:
-    """Yield the number of each retrieval, and its rank and similarity."""
+    """Yield the index of each retrieval, and its rank and similarity as text."""
     pairs = zip(*(each[query, :columns] for each in found.neighbours), strict=True)
     for rank, (index, similarity) in enumerate(pairs, 1):
         yield index, f"{rank}   {similarity:.3f}"
@@ -190,7 +190,7 @@ def _captions(found: Answers | GroupingResult, query: int, columns: int) -> Iter
 def _answers(
     found: Answers, query: int, columns: int, root: str | os.PathLike[str] | None
 ) -> Iterator[_Tile]:
-    """Yield the tiles of a query and what a map answers."""
+    """Yield the tiles of a query and of a map's answers."""
     name = found.names[query] if found.known[query] else f"unknown: {found.names[query]}"
     yield _Tile(found.queries[query], f"query {query}", name=name)
     checks, is_best = iter(found.checks[query] if found.checks else ()), True
@@ -209,7 +209,7 @@ def _answers(
 def _results(
     found: GroupingResult, benchmark: Benchmark, query: int, columns: int
 ) -> Iterator[_Tile]:
-    """Yield the tiles of a query and its retrievals, right and wrong."""
+    """Yield the tiles of a query and its retrievals, correct and wrong."""
     positives = benchmark.ground_truth()[query]
     note = "" if len(positives) else ", no positive exists"
     yield _Tile(benchmark.queries[query], f"query {query}{note}")
@@ -279,7 +279,7 @@ def _draw_tile(axes: Axes, tile: _Tile, image: UInt8[np.ndarray, "h w 3"]) -> No
     axes.spines[:].set(color=GREY if plain else tile.colour, linewidth=0.5 if plain else 3)
     if tile.name:
         below = {"xycoords": "axes fraction", "xytext": (0, -18), "textcoords": "offset points"}
-        # A dollar sign in a name starts no formula.
+        # A dollar sign in a name must not start a formula.
         how = {"va": "top", "fontsize": 7, "family": "monospace", "parse_math": False}
         axes.annotate(shortened(tile.name, _NAME), (0, 0), color=GREY, **below, **how)
 
@@ -291,7 +291,7 @@ def _read(file: Path) -> _Shown:
 
 
 def shortened(text: str, most: int) -> str:
-    """Shorten a text to at most `most` characters, of its beginning and its end."""
+    """Shorten a text to at most `most` characters, from its beginning and its end."""
     if len(text) <= most:
         return text
     end = (most - 1) // 2

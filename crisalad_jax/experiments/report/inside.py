@@ -1,4 +1,4 @@
-"""Figures of what is inside a model: attention, gradients and a plane of descriptors."""
+"""Figures of the inside of a model: attention, gradients and a plane of descriptors."""
 
 import math
 import re
@@ -33,9 +33,9 @@ _SMALL = 96
 _DIVERGING = "PuOr_r"
 _MARKS = "os^DvP"
 _MOST = len(COLOURS) * len(_MARKS)
-"""Number of places that colours and marks tell apart."""
+"""Number of places that colours and marks can distinguish."""
 _NUMBERED = 10
-"""Number of images up to which a matrix has its numbers."""
+"""Number of images up to which a matrix shows its values."""
 
 
 @takes(model=Model)
@@ -49,15 +49,15 @@ def show_attention(
 ) -> Picture:
     """Draw what the class token, or a patch, attends to in a block of a vision transformer.
 
-    Each panel has a scale of its own, from the least to the most that a patch gets, which its title
-    says. What goes to the class token and to registers is not drawn.
+    Each panel has its own scale, from the least to the most that a patch gets, as in its title.
+    Attention to the class token and to registers is not drawn.
 
     Args:
         image: a file, or 8-bit RGB or grey, as `prepare_image` takes it.
         model: the model, as `load` returns it.
         block: number of the block, from 0; negative numbers count from the last.
         head: number of the head, from 0. None draws the mean over the heads, then each of them.
-        patch: row and column of the patch that attends, from 0, which a white square marks. None is
+        patch: row and column of the patch that attends, from 0; a white square marks it. None for
             the class token.
 
     Returns:
@@ -125,9 +125,9 @@ def show_image_attention(
 ) -> Picture:
     """Draw which images attend to which in each layer of the cross-image encoder.
 
-    A row is an image that attends, a column one that it attends to. A cell is the share, a mean
-    over the tokens and the heads; up to ten images it is written in percent. White is an even
-    share, of one over the number of images.
+    A row is an image that attends, a column one that it attends to. A cell is the share, averaged
+    over tokens and heads; for up to ten images it is written in percent. White is an even share,
+    one over the number of images.
 
     Args:
         images: files, or 8-bit RGB or grey, that are described together.
@@ -138,7 +138,7 @@ def show_image_attention(
         A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: no images, or of several sizes where the model keeps them; what
+        InputError: no images, or several sizes if the model does not resize; what
             `cross_image_attention` raises; an image that cannot be read or described.
 
     Example:
@@ -180,7 +180,7 @@ def _draw_matrix(
     ends: tuple[float, float],
     title: str,
 ) -> None:
-    """Draw who attends to whom, with the images beside the rows and above the columns."""
+    """Draw which image attends to which, with the images next to rows and above columns."""
     count = len(images)
     axes.imshow(shares, _DIVERGING, vmin=ends[0], vmax=ends[1])
     for number, image in enumerate(images):
@@ -200,7 +200,7 @@ def _draw_matrix(
 
 
 def show_gradient_norms(norms: Mapping[str, float]) -> Picture:
-    """Draw norms of the gradient by block, and those of the other parts.
+    """Draw gradient norms by block, and those of the other parts.
 
     The scale is logarithmic: a norm of 0, or one that is not finite, is not drawn.
 
@@ -211,7 +211,7 @@ def show_gradient_norms(norms: Mapping[str, float]) -> Picture:
         A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: there are none.
+        InputError: `norms` is empty.
 
     Example:
         >>> norms = {"backbone.blocks.0.adapter": 0.1, "backbone.blocks.1.adapter": 0.2}
@@ -254,17 +254,17 @@ def show_gradient_norms(norms: Mapping[str, float]) -> Picture:
 def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str | int]) -> Picture:
     """Draw descriptors in the plane of their first two principal components, by place.
 
-    Colour and mark are the place's, and thin lines join its descriptors to their mean.
+    Each place has a colour and a mark, and thin lines join its descriptors to their mean.
 
     Args:
         descriptors: at least three, of images of at most 36 places.
-        places: name or number of the place of each.
+        places: name or number of the place of each descriptor.
 
     Returns:
         A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: what `project_to_plane` raises, more places, or no place for each descriptor.
+        InputError: what `project_to_plane` raises, more places, or not one for each descriptor.
 
     Example:
         >>> import numpy as np
@@ -300,5 +300,5 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
     look |= {"loc": "center left", "bbox_to_anchor": (1, 0.5), "ncols": math.ceil(len(names) / 18)}
     legend = axes.legend(marks, list(map(str, names)), **look)
     for text in legend.get_texts():
-        text.set_parse_math(False)  # a dollar sign in a name starts no formula
+        text.set_parse_math(False)  # a dollar sign must not start a formula
     return figure

@@ -39,7 +39,7 @@ PAGE = "index.html"
 _RETRIEVALS = 4
 """Number of retrievals shown for each query."""
 _SHOWN = 6
-"""Largest number of queries shown of each outcome."""
+"""Maximum number of queries shown for each outcome."""
 _THUMBNAIL = 320
 
 
@@ -59,20 +59,20 @@ def write_report(
     query under every grouping.
 
     Args:
-        out: the folder, made where it is missing. Files of the same names are replaced.
-        benchmark: what was evaluated on.
+        out: the folder, created if missing. Files of the same names are replaced.
+        benchmark: the evaluated benchmark.
         groupings: the results, at least one.
-        model: for the section on its transport; a model without one has none.
-        model_name: which weights.
-        settings: those of an `evaluation_record`, shown folded.
-        similarities: what `similarity.similarity_map` gives of the first grouping.
+        model: the model, for the section on its transport, if it has one.
+        model_name: name of the weights.
+        settings: those of an `evaluation_record`, shown collapsed.
+        similarities: what `similarity.similarity_map` returns for the first grouping.
 
     Returns:
         The path of the page.
 
     Raises:
-        InputError: no ground truth, an image that cannot be read, or files that cannot be written:
-            then none of them is.
+        InputError: no ground truth, an image that cannot be read, or files that cannot be written
+            (then none is).
 
     Example:
         >>> import shutil
@@ -122,7 +122,7 @@ def write_report(
 
 
 def render(template: str, context: Mapping[str, Any]) -> str:
-    """Render a template; in a page everything in the context is escaped, names of files too."""
+    """Render a template; in a page, everything in the context is escaped, file names too."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -142,9 +142,9 @@ class Subject(NamedTuple):
     benchmark: Benchmark
     neighbours: Neighbours
     outcomes: np.ndarray
-    """What became of each query, one of `OUTCOMES`."""
+    """Outcome of each query, one of `OUTCOMES`."""
     positions: Positions | None
-    """Where the images were taken; None where that is unknown."""
+    """Where the images were taken; None if unknown."""
 
     @classmethod
     def of(cls, benchmark: Benchmark, neighbours: Neighbours) -> "Subject":
@@ -171,8 +171,8 @@ class Subject(NamedTuple):
     def choose(self, most: int = _SHOWN) -> dict[str, list[int]]:
         """Choose at most `most` queries of each outcome, by similarity and then in file order.
 
-        Wrong queries and those without a positive are the most confident ones, which would do the
-        most harm. Right queries are spread evenly from the most to the least confident.
+        Of wrong queries and those without a positive, the most confident are taken, which would do
+        the most harm. Correct queries are spread evenly from the most to the least confident.
         """
         order = np.argsort(-self.neighbours.similarities[:, 0], kind="stable")
         wrong, unmatched, right = (order[self.outcomes[order] == each] for each in OUTCOMES)
@@ -184,7 +184,7 @@ class Subject(NamedTuple):
 
 
 def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[Drawing]:
-    """Draw recall by K and, where it is known, precision by recall: a line for each grouping."""
+    """Draw recall by K and, if known, precision by recall, with a line for each grouping."""
     best = "; ".join(f"{g.label} {percent(g.recalls[min(g.recalls)])} %" for g in groupings)
     recall = recall_curves({g.label: g.recalls for g in groupings})
     words = f"Recall at K against K. At K = 1: {best}"
@@ -197,7 +197,7 @@ def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[D
 
 
 def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[dict[str, Any]]:
-    """Yield what each query found under a grouping (of the first seed), as rows of results.csv.
+    """Yield the result of each query under a grouping (first seed), as rows of results.csv.
 
     Files are named by their path in the set's folder, with control characters escaped.
     """
@@ -222,7 +222,7 @@ def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[dict[s
 def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
     """Return the rows of the page's table, as short as JSON allows; see queries.js.
 
-    Names lack the folder that all of a column are in.
+    Names leave out the folder that all names of a column share.
     """
     rows = list(query_results(subject, grouping))
     for name in ("query", "first_retrieval"):
@@ -237,7 +237,7 @@ def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
 
 
 def _photographs(subject: Subject, query: int) -> tuple[str, list[Drawing]]:
-    """Name a query, and show it and its first retrievals, and what should have come first."""
+    """Name a query, and show it, its first retrievals, and what should have come first."""
     benchmark = subject.benchmark
     positives = benchmark.ground_truth()[query]
     indices, similarities = (part[query] for part in subject.neighbours)
@@ -292,7 +292,7 @@ def _matrix(
     subject: Subject,
     similarities: Float[np.ndarray, "rows columns"] | None,
 ) -> Drawing | None:
-    """Draw the similarities of all queries and the whole database; None where they are unknown."""
+    """Draw the similarities between all queries and the database; None if they are unknown."""
     if similarities is None:
         return None
     benchmark, first = subject.benchmark, subject.neighbours.indices[:, 0]
@@ -305,9 +305,9 @@ def _matrix(
 def _transport(
     subject: Subject, shown: Mapping[str, list[int]], model: Model
 ) -> Iterator[tuple[str, Drawing]]:
-    """Yield name and drawing of two wrong and two right queries, with their first retrievals.
+    """Yield names and drawings of two wrong and two correct queries, with their first retrievals.
 
-    A model without a transport has none.
+    There are none for a model without a transport.
     """
     if not model.config.aggregator.transports:
         return

@@ -1,4 +1,4 @@
-"""The one layout of all figures, and how they are written and embedded in pages.
+"""The common style of all figures, and how they are written and embedded in pages.
 
 They are drawn with matplotlib's object interface: no display, and no state outside the call.
 """
@@ -33,25 +33,25 @@ RIGHT = "#2a8f3c"
 WRONG = "#c62828"
 UNMATCHED = "#7b1fa2"
 PLAIN = "#c4c4c4"
-"""Of images that are neither, as the database's on a map."""
+"""For images that are none of these, such as the database's on a map."""
 # Okabe and Ito's colours, which the colour-blind can tell apart; without yellow, too light for
 # lines.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 WIDE = {"width": 7.0, "dpi": 120}
-"""Size of a figure that stands for itself."""
+"""Size of a stand-alone figure."""
 FORMATS = (".png", ".svg", ".pdf")
-"""What a figure may be written as: pixels for pages, and vectors for papers."""
+"""Formats in which a figure can be written: pixels for pages, and vectors for papers."""
 _WEBP_QUALITY = 78
 _UNDATED = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
-# Names in an SVG are not drawn at random; a PDF has TrueType fonts, as publishers ask for.
+# Names in an SVG are not random; a PDF has TrueType fonts, as publishers require.
 _FIXED: Any = {"svg.hashsalt": "crisalad", "pdf.fonttype": 42}
 
 
 class Picture(Figure):
-    """A figure that notebooks show by itself, without pyplot and its state."""
+    """A figure that notebooks display directly, without pyplot and its state."""
 
     def _repr_jpeg_(self) -> bytes:
-        """Return the figure for IPython's display; photographs as a PNG fill a notebook."""
+        """Return the figure for IPython's display; photographs as PNG would bloat a notebook."""
         return _encode(self, "jpg", pil_kwargs={"quality": 88})
 
     def savefig(self, fname: Any, **options: Any) -> None:
@@ -65,7 +65,7 @@ class Picture(Figure):
 def new_figure(height: float, title: str = "", *, width: float = 4.0, dpi: int = 200) -> Picture:
     """Make a figure of this size in inches.
 
-    By default letters of 9 points are readable in a page on a telephone.
+    At the default size, 9-point text is readable in a page on a phone.
     """
     # Inches around everything, so that no name touches the edge.
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1)
@@ -106,7 +106,7 @@ def legend_below(figure: Figure) -> None:
 def scale_below(
     figure: Figure, plots: np.ndarray, scale: str, ends: tuple[float, float], label: str
 ) -> Any:
-    """Draw a scale of colours below the plots, and return it."""
+    """Draw a colour bar below the plots, and return it."""
     below: Any = {"location": "bottom", "shrink": 0.5, "aspect": 25, "pad": 0.02}
     colours = ScalarMappable(Normalize(*ends), scale)
     bar: Any = figure.colorbar(colours, ax=plots.ravel().tolist(), **below)
@@ -118,10 +118,10 @@ def scale_below(
 
 @contextlib.contextmanager
 def _any_names(figure: Figure) -> Iterator[None]:
-    """Let texts hold the name of any file while they are drawn.
+    """Allow any file name in the texts of a figure while it is drawn.
 
     Control characters and bytes that are not UTF-8 are drawn as escapes. Letters that the font
-    lacks are drawn as boxes, without the warning that would print them.
+    lacks are drawn as boxes, without a warning.
     """
     for label in figure.findobj(Label):
         label.set_text(printable(label.get_text()))
@@ -137,14 +137,14 @@ def _encode(figure: Picture, kind: str, **options: Any) -> bytes:
 
 
 def save(figure: Picture, path: str | os.PathLike[str]) -> None:
-    """Write a figure in the format of the file's suffix, by default PNG, whole or not at all."""
+    """Write a figure atomically, in the format of the file's suffix, by default PNG."""
     data = _encode(figure, pathlib.Path(path).suffix[1:].lower() or "png")
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
 def save_chart(figure: Picture, path: pathlib.Path) -> None:
-    """Write a figure as a PNG, and as a vector in an SVG and in a PDF of the same name."""
+    """Write a figure as a PNG, and as vector graphics in an SVG and a PDF of the same name."""
     for suffix in FORMATS:
         save(figure, path.with_suffix(suffix))
 
@@ -159,11 +159,11 @@ class Drawing(NamedTuple):
     kind: str = ""
     """How the page frames it."""
     lines: tuple[str, ...] = ()
-    """What is below it."""
+    """Lines of text below it."""
 
 
 def chart(figure: Picture, path: pathlib.Path, alt: str) -> Drawing:
-    """Write a figure as `save_chart`, and embed the PNG."""
+    """Write a figure with `save_chart`, and embed the PNG."""
     save_chart(figure, path)
     return _embed(figure, "png", path.read_bytes(), alt)
 

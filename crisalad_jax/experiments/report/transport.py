@@ -33,8 +33,8 @@ Image = str | os.PathLike[str] | Pixels
 def show_transport(image: Image, model: Model) -> Picture:
     """Draw a picture, each patch's share in the dustbin, and the cluster that took most of it.
 
-    The strongest seven clusters have colours; patches that others took stay grey. A colour's
-    strength is the mass that clusters took of the patch. A transport without a dustbin has no
+    The strongest seven clusters have colours; patches that went to others stay grey. A colour's
+    strength is the mass that clusters took from the patch. A transport without a dustbin has no
     middle panel.
 
     Args:
@@ -124,7 +124,7 @@ def draw_transport(
     """Draw pictures in rows: each patch's share in the dustbin, and its top cluster.
 
     Args:
-        pictures: what is drawn, by the name of its row.
+        pictures: the pictures to draw, by the name of their row.
         among: the pictures that share one scale, and one choice of clusters.
         photographs: whether each row begins with the photograph itself, in a larger figure.
     """
@@ -165,7 +165,7 @@ def draw_transport(
 
 
 def draw_panel(axes: Axes, image: Pixels, title: str, over: np.ndarray | None = None) -> None:
-    """Draw a photograph, or over it in grey a value or a colour for each patch, which tile it."""
+    """Draw a photograph, or in grey with a value or a colour over each patch."""
     axes.set(xticks=[], yticks=[], anchor="N")
     axes.spines[:].set_visible(False)
     axes.set_title(title, loc="left", fontsize=9, color=INK)
@@ -183,7 +183,7 @@ def _cluster_colours(
 ) -> Float[np.ndarray, "row column 4"]:
     """Colour each patch by its top cluster, as RGBA; those of clusters not `chosen` are clear.
 
-    The opacity is the mass that clusters took of the patch, over the largest in the picture.
+    The opacity is the mass that clusters took from the patch, relative to the picture's largest.
     """
     taken = picture.taken.sum(axis=-1)
     shown = np.zeros((*taken.shape, 4))

@@ -1,4 +1,4 @@
-"""Adapters, which are added to the blocks of a vision transformer, one module for each family."""
+"""Adapters for the blocks of a vision transformer, one module for each family."""
 
 import importlib
 import pkgutil

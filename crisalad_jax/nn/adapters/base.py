@@ -1,4 +1,4 @@
-"""Adapters of a vision transformer's blocks: their interface and registry."""
+"""Interface and registry of adapters for the blocks of a vision transformer."""
 
 import abc
 from collections.abc import Mapping
@@ -17,35 +17,35 @@ AnyTokens = Float[Array, "*batch token dim"]
 
 @brief
 class BlockShape(NamedTuple):
-    """The sizes of a block that an adapter is made for."""
+    """The sizes of the block that an adapter is built for."""
 
     dim: int
     """Width of a token."""
     linears: Mapping[str, tuple[int, int]]
-    """Widths of the input and the output of each linear layer: qkv and proj of the attention, and
-    fc1 and fc2 of the MLP (or w12 and w3 of SwiGLU)."""
+    """Input and output widths of each linear layer: qkv and proj of the attention, and fc1 and fc2
+    of the MLP (or w12 and w3 of SwiGLU)."""
 
 
 @brief
 class TokenInfo(NamedTuple):
-    """What a hook knows of the tokens."""
+    """Information about the tokens that a hook receives."""
 
     grid: Grid
     """Rows and columns of patches, the last `grid[0] * grid[1]` tokens."""
     length: int | None = None
-    """Number of first tokens that are not padding; None is all."""
+    """Number of leading non-padding tokens; None means all."""
     valid: Valid = None
-    """Images of a training batch, whose statistics batch norms normalise by
-    (`layers.train_batch_norm`); None takes the stored ones."""
+    """Mask of the training images whose statistics the batch norms use
+    (`layers.train_batch_norm`); None uses the stored statistics."""
 
 
 class Adapter(Part, abc.ABC):
-    """Small layers that are added to every block: a frozen dataclass whose fields are its settings.
+    """Small layers added to every block: a frozen dataclass whose fields are its settings.
 
-    `init` is required, and at least one of the hooks below it does the work. A hook returns what is
-    added to the result of a part of the block, in the shape and type of that result; None adds
-    nothing. All blocks have one shape and run in one loop (`jax.lax.scan`). A hook therefore gets
-    the parameters of one block, and does the same in every block that has an adapter.
+    Implement `init` and at least one of the hooks below it. A hook returns an update that is added
+    to the result of one part of the block, with the shape and dtype of that result; None adds
+    nothing. All blocks have the same shape and run in one loop (`jax.lax.scan`). A hook therefore
+    gets the parameters of a single block, and does the same in every block that has an adapter.
 
     Example:
         >>> import jax
@@ -62,114 +62,114 @@ class Adapter(Part, abc.ABC):
         {'shift': ShapeDtypeStruct(shape=(12, 768), dtype=float32)}
     """
 
-    last = None  # without a type, so that a class may make it a field
-    """Number of the last blocks that have an adapter, with parameters; None is all blocks."""
-    paths = 1  # the same
-    """Number of side paths, of an adapter with a `side_path`. Where it is above 1, `init` returns a
-    tuple: the parameters of each path. `FeatureSpec.path` says which one runs."""
+    last = None  # not annotated, so that a subclass can make it a field
+    """Number of final blocks that have an adapter and its parameters; None means all."""
+    paths = 1  # not annotated either
+    """Number of side paths of an adapter with a `side_path`. Above 1, `init` returns a tuple of the
+    parameters of each path, and `FeatureSpec.path` selects the one that runs."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:
-        """Draw the parameters of one block's adapter, a pytree of arrays in float32.
+        """Draw the parameters of one block's adapter, a pytree of float32 arrays.
 
-        An adapter that should not change a pretrained model at first returns such that it adds 0.
+        To leave a pretrained model unchanged at first, return parameters with which it adds 0.
         """
 
     def check(self, shape: BlockShape) -> None:
-        """Raise InputError where the settings do not fit such a block; by default never."""
+        """Raise InputError if the settings do not fit this block; by default, accept any block."""
 
     def prompts(self, params: Any) -> Float[Array, "prompt dim"] | None:
-        """Return tokens that a block puts in front of an image's, in place of the last block's.
+        """Return the prompts that a block prepends to the tokens, replacing the previous block's.
 
         Args:
-            params: of `init`.
+            params: from `init`.
         """
         return None
 
     def linear_update(
         self, params: Any, name: str, x: Float[Array, "*batch d_in"]
     ) -> Float[Array, "*batch d_out"] | None:
-        """Return what is added to the output of a linear layer of the block.
+        """Return the update to add to the output of one of the block's linear layers.
 
         Args:
-            params: of `init`.
-            name: the layer, one of `BlockShape.linears`.
-            x: the input of the layer.
+            params: from `init`.
+            name: name of the layer, one of `BlockShape.linears`.
+            x: input of the layer.
         """
         return None
 
     def merge(self, params: Any, name: str, layer: Linear) -> Linear:
-        """Return a linear layer whose output has the `linear_update` added (`merge_adapters`).
+        """Return a linear layer with `linear_update` folded into its weights (`merge_adapters`).
 
-        An adapter with this method has no other effect on a block.
+        An adapter with this method must not affect the block in any other way.
 
         Args:
-            params: of `init`.
+            params: from `init`.
             name: see `linear_update`.
-            layer: the layer.
+            layer: the linear layer.
         """
         raise NotImplementedError
 
     def attention_update(
         self, params: Any, attended: AnyTokens, info: TokenInfo
     ) -> AnyTokens | None:
-        """Return what is added to the attention's output, before LayerScale and the residual.
+        """Return the update to add to the attention output, before LayerScale and the residual.
 
         Args:
-            params: of `init`.
-            attended: the output of the attention.
-            info: of these tokens.
+            params: from `init`.
+            attended: output of the attention.
+            info: describes these tokens.
         """
         return None
 
     def mlp_update(
         self, params: Any, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens | None, Any]:
-        """Return what is added to the MLP's output, before LayerScale, and the parameters.
+        """Return the update to add to the MLP output, before LayerScale, and the parameters.
 
         Args:
-            params: of `init`.
-            tokens: the MLP's input, normalised.
-            info: of these tokens.
+            params: from `init`.
+            tokens: normalised input of the MLP.
+            info: describes these tokens.
 
         Returns:
-            (update, updated): the parameters with updated running statistics, if there are any.
+            (update, updated): the second is the parameters, with any running statistics updated.
         """
         return None, params
 
     def output_update(self, params: Any, tokens: AnyTokens, info: TokenInfo) -> AnyTokens | None:
-        """Return what is added to the block's output.
+        """Return the update to add to the output of the block.
 
         Args:
-            params: of `init`.
-            tokens: the output.
-            info: of these tokens.
+            params: from `init`.
+            tokens: output of the block.
+            info: describes these tokens.
         """
         return None
 
     def side_path(
         self, params: Any, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, Any]:
-        """Return the tokens of a path beside the blocks, whose last ones are the backbone's.
+        """Return a side path's tokens after a block; the last ones are the backbone's output.
 
-        The path starts from the tokens before the first block that has an adapter.
+        The path starts from the tokens that enter the first block with an adapter.
 
         Args:
-            params: of `init`, those of the path.
-            side: the path's tokens.
-            tokens: the output of the block.
-            info: of these tokens.
+            params: parameters of this path, from `init`.
+            side: tokens of the path.
+            tokens: output of the block.
+            info: describes these tokens.
 
         Returns:
-            (side, updated): as `mlp_update` returns them.
+            (side, updated): the new tokens of the path, and the parameters as in `mlp_update`.
         """
         raise NotImplementedError
 
     def has(self, *hooks: str) -> bool:
-        """Return whether it has one of these methods of its own."""
+        """Return whether the class overrides at least one of these methods."""
         return any(getattr(type(self), hook) is not getattr(Adapter, hook) for hook in hooks)
 
 
 HOOKS = ("prompts", "linear_update", "attention_update", "mlp_update", "output_update", "side_path")
-"""Methods of adapters that change what a block does."""
+"""Adapter methods that change the computation of a block."""
 ADAPTERS = Registry("adapter", Adapter)

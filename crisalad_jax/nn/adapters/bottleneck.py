@@ -1,7 +1,7 @@
-"""Bottleneck adapters: the paper's (section 3.2), two others of its Table 2, and more.
+"""Bottleneck adapters: the paper's (section 3.2), two others from its Table 2, and more.
 
-All project the tokens down, act on them, and project them up again. The up-projection starts at 0,
-so that an untrained adapter adds nothing.
+All of them project the tokens down, transform them, and project them up again. The up-projection
+starts at 0, so an untrained adapter adds nothing.
 """
 
 import dataclasses
@@ -51,7 +51,7 @@ class DepthwiseAdapter:
 
 @pytree_dataclass
 class MultiResolutionAdapter:
-    """CricaVPR's adapter: parallel 1 x 1, 3 x 3 and 5 x 5 convolutions, the last two reduced."""
+    """CricaVPR's parallel 1 x 1, 3 x 3 and 5 x 5 convolutions, the last two after a reduction."""
 
     down: Linear
     branch1: ConvNorm
@@ -62,7 +62,7 @@ class MultiResolutionAdapter:
 
 @pytree_dataclass
 class MlpAdapter:
-    """A plain MLP, which acts on every token alone; EDTformer's has GELU (Jin et al. 2025)."""
+    """A plain MLP applied to each token independently; EDTformer's has GELU (Jin et al. 2025)."""
 
     down: Linear
     up: Linear
@@ -70,7 +70,7 @@ class MlpAdapter:
 
 @pytree_dataclass
 class SerialParallelAdapter:
-    """SelaVPR's adapters (Lu et al. 2024): after the attention with a skip, parallel to the MLP."""
+    """SelaVPR's adapters (Lu et al. 2024): after the attention with a skip; parallel to the MLP."""
 
     serial: MlpAdapter
     parallel: MlpAdapter
@@ -84,23 +84,23 @@ class NoAdapter(Adapter):
         """Return None: there are no parameters."""
 
     def merge(self, params: None, name: str, layer: Linear) -> Linear:
-        """Return the layer."""
+        """Return the layer unchanged."""
         return layer
 
 
 @dataclasses.dataclass(frozen=True)
 class BottleneckAdapter(Adapter):
-    """What bottleneck adapters share."""
+    """Base class of bottleneck adapters."""
 
     width_factor: ClassVar[int] = 1
-    """Number that the width of the bottleneck must be a multiple of."""
+    """The width of the bottleneck must be a multiple of this."""
     bottleneck: PositiveFloat = 0.5
-    """Width of the adapter over the width of the backbone."""
+    """Width of the adapter divided by the backbone's."""
     alpha: float = 0.2
     """Weight of the adapter's output (paper Eq. 2)."""
 
     def check(self, shape: BlockShape) -> None:
-        """Require a width of at least 1 that divides into the adapter's branches."""
+        """Require a width of at least 1 that divides evenly among the adapter's branches."""
         width, factor = self.width(shape.dim), self.width_factor
         words = (
             f"a width for dim {shape.dim}, {width}, that is at least 1 and a multiple of {factor}"
@@ -119,15 +119,15 @@ class DepthwiseConfig(BottleneckAdapter):
     kernel_size: PositiveInt = 3
     """Side of the depthwise filter."""
     bias: Literal["convolutions", "up"] = "convolutions"
-    """Layers that have biases: the two convolutions, or the up-projection. The paper prints the
-    count of parameters alone (Table 3), which is 741,504 in both readings."""
+    """Layers that have biases: the two convolutions, or the up-projection. The paper gives only the
+    number of parameters (Table 3), which is 741,504 in either case."""
 
     def __post_init__(self) -> None:
         """Check the side of the filter."""
         require_field(self, "kernel_size", self.kernel_size % 2 == 1, "an odd number")
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> DepthwiseAdapter:
-        """Draw parameters as torch's layers start, and an up-projection of 0."""
+        """Draw parameters as torch initialises them, and set the up-projection to 0."""
         width, convolutions = self.width(shape.dim), self.bias == "convolutions"
         down, first, second = random_init.split(key, 3)
         return DepthwiseAdapter(
@@ -153,7 +153,7 @@ class MultiResolutionConfig(BottleneckAdapter):
     width_factor: ClassVar[int] = 16  # the branches take 1/2, 1/4 and 1/16 of the width
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> MultiResolutionAdapter:
-        """Draw parameters as CricaVPR's public code: its convolutions start at 1e-5."""
+        """Draw parameters as CricaVPR's public code does: convolutions start at 1e-5."""
         return _init_multi_resolution(key, shape.dim, self.width(shape.dim))
 
     def mlp_update(
@@ -169,44 +169,44 @@ class MlpConfig(BottleneckAdapter):
     """A plain MLP with ReLU, parallel to the block's (AdaptFormer: Chen et al., NeurIPS 2022)."""
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> MlpAdapter:
-        """Draw a down-projection as torch's, and an up-projection of 0."""
+        """Draw the down-projection as torch does, and set the up-projection to 0."""
         return _init_mlp(key, shape.dim, self.width(shape.dim))
 
     def mlp_update(
         self, params: MlpAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MlpAdapter]:
-        """Return the MLP's output, of every token by itself."""
+        """Return the output of the MLP, applied to each token independently."""
         return self.alpha * _mlp(params, tokens), params
 
 
 @ADAPTERS.register("serial-parallel")
 class SerialParallelConfig(BottleneckAdapter):
-    """SelaVPR's MLPs: one after the attention, of weight 1, one parallel to the MLP (ICLR 2024)."""
+    """SelaVPR's MLPs (ICLR 2024): after the attention with weight 1, and parallel to the MLP."""
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> SerialParallelAdapter:
-        """Draw both as `MlpConfig` does."""
+        """Draw both MLPs as `MlpConfig` does."""
         dim, width = shape.dim, self.width(shape.dim)
         return SerialParallelAdapter(*(_init_mlp(k, dim, width) for k in random_init.split(key)))
 
     def attention_update(
         self, params: SerialParallelAdapter, attended: AnyTokens, info: TokenInfo
     ) -> AnyTokens:
-        """Return the serial MLP's output; the addition is its skip."""
+        """Return the output of the serial MLP; adding it to its input is the skip."""
         return _mlp(params.serial, attended)
 
     def mlp_update(
         self, params: SerialParallelAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, SerialParallelAdapter]:
-        """Return the parallel MLP's output."""
+        """Return the output of the parallel MLP."""
         return self.alpha * _mlp(params.parallel, tokens), params
 
 
 @ADAPTERS.register("side")
 class SideConfig(BottleneckAdapter):
-    """EDTformer's MLPs with GELU, on a path beside all blocks (Jin et al. 2025).
+    """EDTformer's MLPs with GELU, on a side path along all blocks (Jin et al. 2025).
 
-    After every block the path's tokens are s + alpha MLP(s), where s is the sum of its tokens and
-    of the block's output. No gradient runs through the blocks.
+    After each block the tokens of the path become s + alpha MLP(s), where s is their sum with the
+    block's output. No gradient passes through the blocks.
     """
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> MlpAdapter:
@@ -216,26 +216,26 @@ class SideConfig(BottleneckAdapter):
     def side_path(
         self, params: MlpAdapter, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MlpAdapter]:
-        """Add the MLP's output."""
+        """Add the output of the MLP."""
         total = tokens + side
         return _sum(total, self.alpha, _mlp(params, total, gelu)), params
 
 
 @ADAPTERS.register("side-multi-resolution")
 class SideMultiResolutionConfig(BottleneckAdapter):
-    """SelaVPR++'s convolutions, CricaVPR's on paths beside the blocks (Lu et al. 2025).
+    """SelaVPR++'s adapters: CricaVPR's convolutions on side paths (Lu et al. 2025).
 
-    After every block a path's tokens are s + alpha A(s + x), where s are its tokens and x is the
-    block's output. No gradient runs through the blocks.
+    After each block the tokens s of a path become s + alpha A(s + x), where x is the block's
+    output. No gradient passes through the blocks.
     """
 
     width_factor: ClassVar[int] = MultiResolutionConfig.width_factor
     alpha: float = 1.0
     """Weight of the adapter's output."""
     last: PositiveInt | None = None
-    """Number of the last blocks that have it; None is all. SelaVPR++'s ViT-L has 16."""
+    """Number of final blocks that have it; None means all. SelaVPR++'s ViT-L has 16."""
     paths: PositiveInt = 1
-    """Number of side paths: 2 where the second is of binary descriptors."""
+    """Number of side paths: 2 if the second is for binary descriptors."""
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:
         """Draw parameters as `MultiResolutionConfig` does, the same for each path."""
@@ -245,7 +245,7 @@ class SideMultiResolutionConfig(BottleneckAdapter):
     def side_path(
         self, params: MultiResolutionAdapter, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MultiResolutionAdapter]:
-        """Add the convolutions of the sum with the block's output."""
+        """Add the convolutions of the path's tokens plus the block's output."""
         update, updated = _multi_resolution(params, tokens + side, info)
         return _sum(side, self.alpha, update), updated
 
@@ -294,10 +294,10 @@ def _mlp(
 def _on_patches(
     mix: Callable[[Map], tuple[Map, Any]], hidden: AnyTokens, info: TokenInfo
 ) -> tuple[AnyTokens, Any]:
-    """Apply a convolution to the patches; return the tokens and what else it returned.
+    """Apply a convolution to the patches; return the tokens and its other result.
 
-    It is the identity on the class and register tokens before the patches, and on padding. With
-    the skip that follows, these tokens therefore count twice, as in CricaVPR.
+    The class and register tokens before the patches, and padding, pass through unchanged. With the
+    skip that follows, these tokens therefore count twice, as in CricaVPR.
     """
     *batch, count, width = hidden.shape
     last = count if info.length is None else info.length

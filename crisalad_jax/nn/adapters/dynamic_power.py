@@ -1,6 +1,6 @@
-"""SAGE's dynamic power (ICLR 2026): every number of a block's output is raised to one exponent.
+"""SAGE's dynamic power (ICLR 2026): all elements of a block's output are raised to one power.
 
-Written from the facts of the public model; the training code is not published.
+Written from facts about the public model; the training code is not published.
 """
 
 from jaxtyping import PRNGKeyArray
@@ -14,20 +14,20 @@ from crisalad_jax.nn.layers import TwoLayer, init_two_layer, powers
 class DynamicPowerConfig(Adapter):
     """SAGE's dynamic power after each of the last blocks: x + sign(x) (|x| + 1e-6)^p.
 
-    The exponent p, from 0 to 1, is of an image: a small network of the mean of all tokens. The
-    power jumps at 0, so numbers near it are sensitive to rounding.
+    A small network computes the exponent p of an image, from 0 to 1, from the mean of all tokens.
+    The power is discontinuous at 0, so values near 0 are sensitive to rounding.
     """
 
     last: PositiveInt | None = 4
-    """Number of the last blocks that have it; None is all."""
+    """Number of final blocks that have it; None means all."""
     hidden: PositiveInt = 16
     """Width of the network."""
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> TwoLayer:
-        """Draw the network as torch's linear layers."""
+        """Draw the network as torch draws linear layers."""
         return init_two_layer(key, shape.dim, self.hidden, 1)
 
     def output_update(self, params: TwoLayer, tokens: AnyTokens, info: TokenInfo) -> AnyTokens:
-        """Return the powers."""
+        """Return the powers of the tokens."""
         mean = tokens[..., : info.length, :].mean(axis=-2, keepdims=True)
         return powers(params, tokens, mean)

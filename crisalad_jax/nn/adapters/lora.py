@@ -1,4 +1,4 @@
-"""LoRA: linear layers with an update of low rank (Hu et al. 2021)."""
+"""LoRA: low-rank updates of linear layers (Hu et al. 2021)."""
 
 import dataclasses
 from typing import Literal
@@ -24,7 +24,7 @@ class LowRank:
 
 @ADAPTERS.register("lora")
 class LoraConfig(Adapter):
-    """Updates of low rank to linear layers, W x + alpha / rank B A x (LoRA: Hu et al. 2021).
+    """Low-rank updates of linear layers, W x + alpha / rank B A x (LoRA: Hu et al. 2021).
 
     There is no dropout. `merge_adapters` adds the products to the weights for inference.
     """
@@ -32,19 +32,19 @@ class LoraConfig(Adapter):
     rank: PositiveInt = 8
     """Rank of the updates."""
     alpha: PositiveFloat = 8.0
-    """Weight of the updates times the rank."""
+    """Updates are scaled by alpha / rank."""
     layers: tuple[Literal["qkv", "proj", "fc1", "fc2", "w12", "w3"], ...] = ("qkv", "proj")
     """Layers with an update: qkv and proj of the attention, fc1 and fc2 of the MLP, w12 and w3 of a
     SwiGLU."""
 
     def check(self, shape: BlockShape) -> None:
-        """Require layers that the block has, each once."""
+        """Require that the block has these layers and that each is named once."""
         layers = ", ".join(shape.linears)
         fits = 0 < len(self.layers) == len({*self.layers} & {*shape.linears})
         require_field(self, "layers", fits, f"some of {layers}, each once")
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> dict[str, LowRank]:
-        """Draw A as torch's linear layers (as the authors' code does), and start B at 0."""
+        """Draw A as torch draws linear layers (as in the authors' code), and set B to 0."""
         keys = zip(self.layers, random_init.split(key, len(self.layers)), strict=True)
         return {name: self._init_layer(each, *shape.linears[name]) for name, each in keys}
 
@@ -55,7 +55,7 @@ class LoraConfig(Adapter):
     def linear_update(
         self, params: dict[str, LowRank], name: str, x: Float[Array, "*batch d_in"]
     ) -> Float[Array, "*batch d_out"] | None:
-        """Return x A B, scaled: neither A B nor a gradient of its size is computed."""
+        """Return the scaled x A B, without computing A B or a gradient of its size."""
         if name not in params:
             return None
         hidden = keep(linear(params[name].down, x), "down")

@@ -1,4 +1,4 @@
-"""Visual prompts: learnt tokens beside an image's own (Jia et al., ECCV 2022)."""
+"""Visual prompts: learnt tokens in addition to an image's own (Jia et al., ECCV 2022)."""
 
 import math
 
@@ -12,7 +12,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class Prompts:
-    """The tokens of a block."""
+    """The prompts of a block."""
 
     tokens: Float[Array, "*stack prompt dim"]
 
@@ -21,19 +21,19 @@ class Prompts:
 class PromptsConfig(Adapter):
     """Prompts in every block (VPT-deep: Jia et al., ECCV 2022), without dropout.
 
-    The tokens of an image attend to the block's prompts, whose own outputs are dropped. Attention
-    takes longer by their number. Unlike other adapters, untrained ones change the descriptors.
+    The tokens of an image attend to the block's prompts, whose own outputs are dropped. Each prompt
+    adds a token to the attention. Unlike other adapters, untrained prompts change the descriptors.
     """
 
     count: PositiveInt = 10
-    """Number of prompts in a block."""
+    """Number of prompts per block."""
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> Prompts:
-        """Draw uniformly within sqrt(3 / dim), as the authors' code does for ViT-B/16."""
+        """Draw prompts uniformly within sqrt(3 / dim), as the authors' code does for ViT-B/16."""
         bound = math.sqrt(3 / shape.dim)
         tokens = random_init.uniform(key, (self.count, shape.dim), minval=-bound, maxval=bound)
         return Prompts(tokens)
 
     def prompts(self, params: Prompts) -> Float[Array, "prompt dim"]:
-        """Return the tokens."""
+        """Return the prompts."""
         return params.tokens

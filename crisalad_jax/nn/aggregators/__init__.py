@@ -1,4 +1,4 @@
-"""Aggregators, from features to an image's tokens: a module for each method of docs/methods.md."""
+"""Aggregators, which turn features into tokens: one module for each method of docs/methods.md."""
 
 import importlib
 import pkgutil

@@ -1,4 +1,4 @@
-"""Tokens that the backbone itself makes: its class token, or learnt ones that run through it."""
+"""Tokens from the backbone itself: its class token, or learnt tokens that run through it."""
 
 from typing import ClassVar
 
@@ -22,7 +22,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @AGGREGATORS.register("class-token")
 class ClassTokenConfig(Aggregator):
-    """The backbone's class token, by itself (Oquab et al. 2023)."""
+    """The backbone's class token as the only token (Oquab et al. 2023)."""
 
     class_token: ClassVar[bool] = True
 
@@ -31,7 +31,7 @@ class ClassTokenConfig(Aggregator):
         return TokenShape(dim, 0, dim)
 
     def apply(self, params: None, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the class token as it is."""
+        """Return the class token unchanged."""
         return Tokens.of_global(at_least_float32(features.class_token))
 
 
@@ -57,11 +57,10 @@ class AggregationTokensConfig(Aggregator):
     tokens: PositiveInt = 8
     """Number of learnt tokens."""
     insertion: int = -4
-    """Block before which they are put in front of all others, from 0, or from the end where
-    negative."""
+    """Block before which they are prepended to all others, from 0, or from the end if negative."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request that the tokens run through the blocks from `insertion`.
+        """Request that the tokens run through the blocks from `insertion` on.
 
         Raises:
             InputError: there is no such block.
@@ -74,11 +73,11 @@ class AggregationTokensConfig(Aggregator):
         return TokenShape(0, self.tokens, dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> AggregationTokens:
-        """Draw tokens of deviation 1e-6, as published; `from_centroids` replaces them."""
+        """Draw tokens with deviation 1e-6, as published; `from_centroids` replaces them."""
         return AggregationTokens(random_init.normal(key, (self.tokens, backbone.dim), scale=1e-6))
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> AggregationTokens:
-        """Make tokens as the authors do: centroids of the length of NetVLAD's first scores."""
+        """Make tokens as the authors do: centroids scaled as NetVLAD's initial score weights."""
         return AggregationTokens(scores_from_centroids(centroids, features).weight.T)
 
     def inserted(self, params: AggregationTokens) -> Float[Array, "token dim"]:
@@ -88,6 +87,6 @@ class AggregationTokensConfig(Aggregator):
     def apply(
         self, params: AggregationTokens, features: Features, grid: Grid, *, key: Keys
     ) -> Tokens:
-        """Return the tokens as the backbone's last layer norm leaves them."""
+        """Return the tokens after the backbone's last layer norm."""
         assert features.inserted is not None
         return Tokens.of_local(at_least_float32(features.inserted))

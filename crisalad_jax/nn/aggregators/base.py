@@ -31,7 +31,7 @@ class TokenShape(NamedTuple):
     """The shape of an image's tokens: a global one and local ones."""
 
     global_dim: int
-    """Width of the global token; 0 where there is none."""
+    """Width of the global token; 0 if there is none."""
     tokens: int
     """Number of local tokens."""
     token_dim: int
@@ -39,10 +39,10 @@ class TokenShape(NamedTuple):
 
 
 class Aggregator(Part, abc.ABC):
-    """A method that makes tokens of features: a frozen dataclass whose fields are its settings.
+    """A method that turns features into tokens: a frozen dataclass whose fields are its settings.
 
-    `token_shape` and `apply` are required. A plain function of one image's `Features` that returns
-    a vector, or a matrix of token vectors, is an aggregator without parameters.
+    Implement `token_shape` and `apply`. A plain function of one image's `Features` that returns a
+    vector, or a matrix of token vectors, works as an aggregator without parameters.
 
     Example:
         >>> from crisalad_jax import ModelConfig, register_aggregator
@@ -60,22 +60,22 @@ class Aggregator(Part, abc.ABC):
     """
 
     flatten_order: ClassVar[FlattenOrder] = "token-first"
-    """Order of a descriptor's numbers: token after token, or the first dimension of all local
+    """Order of a descriptor's dimensions: token by token, or the first dimension of all local
     tokens, then their second, and so on."""
     trainable: ClassVar[bool] = True
-    """Whether its parameters train; if not, no part of the model does."""
+    """Whether its parameters train; if not, no part of the model trains."""
     fixed_grid: ClassVar[bool] = False
-    """Whether its parameters fit the patches of one image size only."""
+    """Whether its parameters fit only one image size."""
     centroid_images: ClassVar[int] = 500
-    """Number of training images, at most, whose features' centroids training starts from."""
+    """Maximum number of training images from whose features the initial centroids are computed."""
     spherical_centroids: ClassVar[bool] = False
-    """Whether k-means compares features with centroids by the angle, not the distance. A centroid
-    is the mean of its features either way."""
+    """Whether k-means compares features with centroids by angle instead of distance. Either way a
+    centroid is the mean of its features."""
     class_token: ClassVar[bool] = False
-    """Whether it takes the backbone's class token, with the last patches."""
+    """Whether it uses the backbone's class token, with the last block's patches."""
 
     def numbers(self, params: Any) -> Mapping[str, Any]:
-        """Return numbers of the parameters that validations log by name; by default none."""
+        """Return values of the parameters to log by name at each validation; by default none."""
         return {}
 
     @abc.abstractmethod
@@ -91,58 +91,58 @@ class Aggregator(Part, abc.ABC):
         return FeatureSpec(class_token=self.class_token)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Any:
-        """Draw random parameters, a pytree of arrays in float32; by default None.
+        """Draw random parameters, a pytree of float32 arrays; by default None.
 
         Args:
-            key: draws them.
+            key: random key.
             backbone: the backbone of the features.
             grid: rows and columns of patches in an image of the model's size.
         """
         return None
 
     def inserted(self, params: Any) -> Float[Array, "inserted dim"] | None:
-        """Return tokens of its own that run through the backbone's blocks; by default None.
+        """Return additional tokens to run through the backbone's blocks; by default None.
 
-        `features` says after which block they are inserted, and `Features.inserted` has them.
+        `features` sets the block after which they are inserted; `Features.inserted` holds them.
         """
         return None
 
     @abc.abstractmethod
     def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the tokens of one image or of a batch, in float32 at least.
+        """Return the tokens of one image or of a batch, in at least float32.
 
         Args:
-            params: of `init`.
-            features: as `features` asks for.
+            params: from `init`.
+            features: as requested by `features`.
             grid: rows and columns of patches.
-            key: draws dropout, one for all or one an image; None means inference.
+            key: for dropout, one for all images or one for each; None means inference.
         """
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
-        """Raise InputError where an image with this grid is too small; by default never."""
+        """Raise InputError if an image with this grid is too small; by default, accept any grid."""
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Any:
         """Make parameters from k-means centroids of unit features.
 
-        `starts_from_centroids` tells whether an aggregator has this.
+        Only aggregators with `starts_from_centroids` implement it.
 
         Args:
-            centroids: of `centroid_features`.
+            centroids: k-means centroids of `centroid_features`.
             features: unit features.
         """
         raise NotImplementedError
 
     def with_frequencies(self, params: Any, images: Sequence[Any]) -> Any:
-        """Return parameters with weights by how many images have each centroid; by default none.
+        """Weight the centroids by how many images have each; by default return `params`.
 
         Args:
-            params: of `from_centroids`.
+            params: from `from_centroids`.
             images: unit features of each image, (feature, dim).
         """
         return params
 
     def centroid_features(self, features: FeatureRows) -> Float[Array, "feature reduced"]:
-        """Return what k-means makes its centroids of; by default the unit features themselves."""
+        """Return the features to cluster by k-means; by default the unit features themselves."""
         return features
 
     def count_centroids(self, dim: int) -> int:
@@ -159,14 +159,14 @@ class Aggregator(Part, abc.ABC):
 
     @property
     def transports(self) -> bool:
-        """Whether it has a `plan`."""
+        """Whether it implements `plan`."""
         return type(self).plan is not Aggregator.plan
 
     def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"]:
         """Return the mass that a transport sends from each patch to each cluster.
 
-        A patch sends a mass of 1. If there is a dustbin, it is the last column. `transports` tells
-        whether an aggregator has this.
+        A patch sends a mass of 1. If there is a dustbin, it is the last column. Only aggregators
+        with `transports` implement this.
         """
         raise InputError(
             f"aggregator: found {self.part_name}, expected one that transports, such as salad"
@@ -178,12 +178,12 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
 
     Args:
         tokens: what `apply` returned.
-        aggregator: which returned it.
+        aggregator: the aggregator that returned them.
         dim: width of the features.
         batch: shape of the batch.
 
     Raises:
-        InputError: it has not; the message names the aggregator.
+        InputError: they do not match; the message names the aggregator.
     """
     shape = TokenShape(*aggregator.token_shape(dim))
     wide = jnp.result_type(jnp.float32, *jax.tree.leaves(tokens))
@@ -195,10 +195,10 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
 
 
 def require_side(name: str, grid: Grid, regions: int, patch_size: int) -> None:
-    """Check that there is a patch for every region of a side.
+    """Check that each side of the grid has a patch for every region.
 
     Raises:
-        InputError: there is not.
+        InputError: a side has fewer patches than regions.
     """
     side = regions * patch_size
     height, width = (patch_size * each for each in grid)

@@ -22,7 +22,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class ConvAp:
-    """The 1 x 1 convolution: a linear layer at every patch."""
+    """The 1 x 1 convolution, a linear layer applied to every patch."""
 
     channel_pool: Linear
 
@@ -46,15 +46,15 @@ class ConvApConfig(Aggregator):
         require_side(self.part_name, grid, self.side, patch_size)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> ConvAp:
-        """Draw parameters as torch's convolutions do."""
+        """Draw parameters as torch draws convolutions."""
         return ConvAp(init_linear(key, backbone.dim, self.channels))
 
     def apply(self, params: ConvAp, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token for each of side x side regions, row by row.
 
         The published order is convolution, then means. Both are linear and the weights of a mean
-        add up to 1, so the order is free. Means first make the convolution cheaper, by the ratio
-        of patches to regions.
+        add up to 1, so the order does not matter. Taking the means first makes the convolution
+        cheaper, by the ratio of patches to regions.
         """
         means = adaptive_means(at_least_float32(features.patches), grid, self.side)
         tokens = linear(params.channel_pool, means.astype(features.patches.dtype))
@@ -64,7 +64,7 @@ class ConvApConfig(Aggregator):
 def adaptive_means(patches: Patches, grid: Grid, side: int) -> Float[Array, "*batch region dim"]:
     """Average the patches over side x side regions, as torch's `AdaptiveAvgPool2d` cuts them.
 
-    Region i of a side of n patches goes from floor(i n / side) to ceil((i + 1) n / side): where
+    Region i of a side of n patches goes from floor(i n / side) to ceil((i + 1) n / side): if
     `side` does not divide n, neighbours share a row or column.
     """
     cuts = ([(i * n // side, -(-(i + 1) * n // side)) for i in range(side)] for n in grid)

@@ -23,11 +23,11 @@ from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 GEM_FLOOR = 1e-6
-"""Floor of the numbers of a generalised mean, because negative numbers have no power."""
+"""Lower bound of the values in a generalised mean, because negative ones have no real power."""
 START = 3.0
 """Initial exponent of public implementations."""
 PYRAMID_LEVELS = (2, 3)
-"""Cuts of a side, as CricaVPR's: 4 and 9 regions."""
+"""Regions along a side, as in CricaVPR: 4 and 9 in all."""
 
 
 @pytree_dataclass
@@ -46,7 +46,7 @@ class GemConfig(Aggregator):
         return TokenShape(dim, 0, dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Gem:
-        """Start at an exponent of 3, as public implementations do."""
+        """Set the exponent to 3, as public implementations do."""
         return Gem(random_init.full((), START))
 
     def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
@@ -58,7 +58,7 @@ class GemConfig(Aggregator):
 class GemPyramidConfig(GemConfig):
     """CricaVPR's class token and generalised means over 13 regions (Lu et al., CVPR 2024).
 
-    All regions have one exponent.
+    All regions share one exponent.
     """
 
     class_token: ClassVar[bool] = True
@@ -97,11 +97,11 @@ class CosPlaceConfig(Aggregator):
         return TokenShape(self.dim, 0, self.dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> CosPlace:
-        """Draw parameters as the public code: an exponent of 3, torch's default linear layer."""
+        """Draw parameters as the public code does: exponent 3, torch's default linear layer."""
         return CosPlace(random_init.full((), START), init_linear(key, backbone.dim, self.dim))
 
     def apply(self, params: CosPlace, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return a linear layer of the generalised mean of unit patches.
+        """Apply a linear layer to the generalised mean of unit patches.
 
         The descriptor is scaled to unit length later.
         """
@@ -117,7 +117,7 @@ class Whitening:
     components: Float[Array, "dim dim"]
     """Orthonormal rows."""
     variance: Float[Array, " dim"]
-    """Of the fitted descriptors along the components."""
+    """Fitted descriptors' variance along components."""
 
 
 @pytree_dataclass
@@ -137,15 +137,15 @@ class ApGemConfig(CosPlaceConfig):
     """Width of the linear layer and of the descriptor."""
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> ApGem:
-        """Draw as CosPlace's, with a whitening that changes nothing."""
+        """Draw parameters as in CosPlace, with the identity as whitening."""
         head, zeros, ones = super().init(key, backbone, grid), random_init.zeros, random_init.ones
         whitening = Whitening(zeros(self.dim), jnp.diag(ones(self.dim)), ones(self.dim))
         return ApGem(head.p, head.fc, whitening)
 
     def apply(self, params: ApGem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the whitened unit output of a linear layer of the mean of patches as they are.
+        """Apply a linear layer to the mean of raw patches, then normalise and whiten the output.
 
-        The whitening is measured, not learnt: no gradient changes it.
+        The whitening is measured, not learnt: it gets no gradient.
         """
         patches = features.patches
         mean = generalised_mean(log_floored(patches), params.p, axes=(-2,)).astype(patches.dtype)
@@ -154,27 +154,27 @@ class ApGemConfig(CosPlaceConfig):
 
 
 def whiten(params: Whitening, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
-    """Divide components by the variance to the 1/4, as the public code's evaluation does."""
+    """Divide components by variance^(1/4), as the evaluation of the public code does."""
     components = jnp.matmul(x - params.mean, params.components.T, precision="highest")
     return components * params.variance**-0.25
 
 
 def gem(patches: Patches, p: Float[Array, ""]) -> Float[Array, "*batch dim"]:
-    """Compute the generalised mean of all unit patches, in float32 at least."""
+    """Compute the generalised mean of all unit patches, in at least float32."""
     return generalised_mean(log_units(patches), p, axes=(-2,))
 
 
 def log_units(patches: Patches) -> Patches:
-    """Compute the logarithms of unit patches, with numbers raised to the floor.
+    """Compute the logarithms of unit patches, with values clamped to the floor.
 
-    Unit length and floor are those of CosPlace, CricaVPR and the benchmark of Berton et al. (CVPR
-    2022). The result is float32 at least.
+    CosPlace, CricaVPR and the benchmark of Berton et al. (CVPR 2022) use the same normalisation
+    and floor. The result is at least float32.
     """
     return log_floored(l2_normalise(at_least_float32(patches)))
 
 
 def log_floored(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Compute logarithms of numbers raised to the floor, in float32 at least."""
+    """Compute logarithms of values clamped to the floor, in at least float32."""
     return jnp.log(jnp.maximum(at_least_float32(x), GEM_FLOOR))
 
 
@@ -183,8 +183,8 @@ def generalised_mean(
 ) -> Float[Array, "*rest"]:
     """Compute (mean of x^p)^(1/p) along `axes` from the logarithms of x (Radenovic et al., Eq. 3).
 
-    Logarithms avoid an underflow: in float32 the floor's power is 0 from an exponent of 6.4 on, and
-    a mean of zeros has no gradient.
+    Logarithms avoid underflow: in float32 the floor's power is 0 from an exponent of 6.4 on, and a
+    mean of zeros has no gradient.
     """
     count = math.prod(logs.shape[i] for i in axes)
     return jnp.exp((jax.nn.logsumexp(p * logs, axis=axes) - math.log(count)) / p)
@@ -196,7 +196,7 @@ def gem_pyramid(
     """Compute generalised means (Radenovic et al. 2018) of unit patches in 2 x 2 and 3 x 3 regions.
 
     Regions come level by level in row order. A side of n patches is cut at round(i n / level). For
-    CricaVPR's fixed 16 x 16 grid that gives its published cuts at 8, and at 5 and 11.
+    CricaVPR's fixed 16 x 16 grid this gives its published cuts at 8, and at 5 and 11.
     """
     logs, means = log_units(patches), []
     for level in PYRAMID_LEVELS:

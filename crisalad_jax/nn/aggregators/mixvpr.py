@@ -1,6 +1,6 @@
 """MixVPR: networks that mix all positions of a feature map (Ali-bey et al., WACV 2023).
 
-The parameters fit one grid of patches, so a model describes images of one size only.
+The parameters fit one grid of patches, so a model accepts images of one size only.
 """
 
 import math
@@ -56,12 +56,12 @@ class MixVprConfig(Aggregator):
     rows: PositiveInt = 4
     """Number of values of each channel after the projection."""
     depth: PositiveInt = 4
-    """Number of feature mixers, as wide inside as there are patches."""
+    """Number of feature mixers, each as wide as there are patches."""
     last_norm: bool = True
-    """Whether patches go through the backbone's last layer norm. In DINO-Mix they do not."""
+    """Whether the backbone's last layer norm is applied. In DINO-Mix it is not."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches."""
+        """Request the patches of the last block."""
         return FeatureSpec(norm=self.last_norm)
 
     def token_shape(self, dim: int) -> TokenShape:
@@ -72,7 +72,7 @@ class MixVprConfig(Aggregator):
         """Draw parameters as the public implementation does.
 
         Mixers have zero biases and normal weights of deviation 0.02. (The public code truncates
-        them at 100 deviations, which has no effect.) Projections start as torch's linears.
+        them at 100 deviations, which has no effect.) Projections are torch's linear layers.
         """
         mixers, channels, rows = random_init.split(key, 3)
         patches = math.prod(grid)
@@ -86,7 +86,7 @@ class MixVprConfig(Aggregator):
         )
 
     def apply(self, params: MixVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return a token of `channels` numbers for each row (paper Eqs. 1 to 4)."""
+        """Return a token of width `channels` for each row (paper Eqs. 1 to 4)."""
         maps = features.patches.swapaxes(-2, -1)
         for mixer in params.mix:
             hidden = linear(mixer.fc1, layer_norm(mixer.norm, maps))

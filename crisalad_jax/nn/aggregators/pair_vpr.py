@@ -38,7 +38,7 @@ _norm = functools.partial(layer_norm, epsilon=NORM_EPSILON)
 
 @pytree_dataclass
 class PairLayer:
-    """Attention of an image's tokens to each other, then to the other image's; a network."""
+    """Self-attention of an image's tokens, cross-attention to the other image's, and an MLP."""
 
     norm1: LayerNorm
     attn: Attention
@@ -47,15 +47,15 @@ class PairLayer:
     norm3: LayerNorm
     mlp: TwoLayer
     norm_other: LayerNorm
-    """Of the other image's tokens, which no layer changes."""
+    """Norm of the other image's tokens (never updated)."""
 
 
 @pytree_dataclass
 class PairVpr:
-    """The layer of the descriptor, and the decoder, which no descriptor needs."""
+    """The linear layer of the descriptor, and the decoder, which descriptors do not need."""
 
     cls_token: Float[Array, " width"]
-    """The decoder's own, which the logit is made of."""
+    """Decoder's class token, which gives the logit."""
     positions: Float[Array, "position width"]
     """Position embeddings of a square grid, in row order; the class token has none."""
     embed: Linear
@@ -83,7 +83,7 @@ class PairVprConfig(Aggregator):
     width: PositiveInt = 768
     """Width of the decoder."""
     layers: PositiveInt = 12
-    """Number of the decoder's layers."""
+    """Number of decoder layers."""
     hidden: PositiveInt = 512
     """Hidden width of the network that makes the logit."""
     positions: PositiveInt = 529
@@ -98,7 +98,7 @@ class PairVprConfig(Aggregator):
 
     @property
     def heads(self) -> int:
-        """Number of heads of every attention of the decoder."""
+        """Number of heads of every attention in the decoder."""
         return max(1, self.width // 64)
 
     def token_shape(self, dim: int) -> TokenShape:
@@ -106,7 +106,7 @@ class PairVprConfig(Aggregator):
         return TokenShape(self.dim, 0, self.dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> PairVpr:
-        """Draw layers as torch's, and tokens of deviation 0.02."""
+        """Draw layers as torch does, and tokens with deviation 0.02."""
         keys = random_init.split(key, 6)
         normal = functools.partial(random_init.normal, scale=0.02)
         return PairVpr(
@@ -132,17 +132,17 @@ class PairVprConfig(Aggregator):
         )
 
     def apply(self, params: PairVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the projected class token, and no local token."""
+        """Return the projected class token, without local tokens."""
         return Tokens.of_global(at_least_float32(linear(params.reduction, features.class_token)))
 
     def logits(
         self, params: PairVpr, first: Patches, second: Patches, grid: Grid
     ) -> Float[Array, "*batch"]:
-        """Compute a logit of each ordered pair of images, which is larger for the same place.
+        """Compute a logit for each ordered pair of images, which is larger for the same place.
 
         Args:
-            params: of `init`.
-            first: patches of an image of each pair, by the backbone's last layer norm.
+            params: from `init`.
+            first: patches of one image of each pair, from the backbone's last layer norm.
             second: patches of the other, which `first` attends to.
             grid: rows and columns of patches of both.
         """

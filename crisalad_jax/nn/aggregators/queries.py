@@ -1,6 +1,6 @@
-"""Learnt queries that ask transformer layers: BoQ and EDTformer.
+"""Learnt queries that attend to features in transformer layers: BoQ and EDTformer.
 
-Attentions and encoder layers are torch's: `nn.MultiheadAttention` and, with ReLU, post-norm and a
+Attention and encoder layers are torch's: `nn.MultiheadAttention` and, with ReLU, post-norm and a
 feed-forward network of four times the width, `nn.TransformerEncoderLayer`.
 """
 
@@ -51,7 +51,7 @@ class BoqBlock:
 
 @pytree_dataclass
 class Boq:
-    """The channel reduction, the blocks in order, and the linear layer from answers to rows."""
+    """The channel reduction, the blocks in order, the linear layer from query outputs to rows."""
 
     proj_c: Conv
     norm_input: LayerNorm
@@ -67,13 +67,13 @@ class BoqConfig(Aggregator):
     channels: PositiveInt = 384
     """Number of channels after the 3 x 3 convolution."""
     queries: PositiveInt = 64
-    """Number of learnt queries of a block."""
+    """Number of learnt queries per block."""
     layers: PositiveInt = 2
     """Number of blocks, each an encoder layer and its queries."""
     rows: PositiveInt = 32
-    """Number of rows that a linear layer makes of all blocks' answers."""
+    """Number of rows that a linear layer makes of all query outputs."""
     last_norm: bool = False
-    """Whether patches go through the backbone's last layer norm. In the public code they do not."""
+    """Whether the backbone's last layer norm is applied. In the public code it is not."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -82,11 +82,11 @@ class BoqConfig(Aggregator):
 
     @property
     def heads(self) -> int:
-        """Number of heads of every attention, as the public code has them."""
+        """Number of heads of every attention, as in the public code."""
         return max(1, self.channels // 64)
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches, by default as the last block leaves them."""
+        """Request the patches of the last block, by default without the last layer norm."""
         return FeatureSpec(norm=self.last_norm)
 
     def token_shape(self, dim: int) -> TokenShape:
@@ -94,7 +94,7 @@ class BoqConfig(Aggregator):
         return TokenShape(0, self.rows, self.channels)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Boq:
-        """Draw parameters as the public code: standard normal queries, the rest as torch's."""
+        """Draw parameters as the public code does: standard normal queries, the rest as torch's."""
         conv_key, blocks_key, rows_key = random_init.split(key, 3)
         keys = random_init.split(blocks_key, self.layers)
         return Boq(
@@ -105,7 +105,7 @@ class BoqConfig(Aggregator):
         )
 
     def apply(self, params: Boq, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return a token of `channels` numbers for each row."""
+        """Return a token of width `channels` for each row."""
         patches = features.patches
         maps = patches.reshape(-1, *grid, patches.shape[-1])
         maps = conv(params.proj_c, maps)
@@ -115,7 +115,7 @@ class BoqConfig(Aggregator):
         for block in params.boqs:
             attended = attention(block.encoder.attn, x, self.heads)
             x = encoder_layer(block.encoder, x, attended, jax.nn.relu)
-            # The queries' self-attention depends on no image: it runs once for a whole batch.
+            # The queries' self-attention does not depend on the images: it runs once per batch.
             queries = block.queries.astype(x.dtype)
             queries = queries + attention(block.self_attn, queries, self.heads)
             queries = layer_norm(block.norm_q, queries)
@@ -139,7 +139,7 @@ def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:
 
 @pytree_dataclass
 class DecoderLayer:
-    """Attention of the queries to each other, then to the backbone's tokens."""
+    """Self-attention of the queries, then cross-attention to the backbone's tokens."""
 
     self_attn: Attention
     multihead_attn: Attention
@@ -149,7 +149,7 @@ class DecoderLayer:
 
 @pytree_dataclass
 class EdtFormer:
-    """Queries, the layer that the backbone's tokens go through, the decoder, two projections."""
+    """Queries, the linear layer over the backbone's tokens, the decoder, two projections."""
 
     queries: Float[Array, "query width"]
     fc: Linear
@@ -173,14 +173,14 @@ class EdtFormerConfig(Aggregator):
     width: PositiveInt = 768
     """Width of the decoder."""
     heads: PositiveInt = 16
-    """Number of heads of every attention."""
+    """Number of attention heads."""
     layers: PositiveInt = 2
     queries: PositiveInt = 64
     """Number of learnt queries."""
     channels: PositiveInt = 256
-    """Number of channels of an answer after its projection."""
+    """Number of channels of a projected query output."""
     rows: PositiveInt = 16
-    """Number of rows that a linear layer makes of all answers."""
+    """Number of rows that a linear layer makes of the outputs."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -192,9 +192,9 @@ class EdtFormerConfig(Aggregator):
         return TokenShape(0, self.rows, self.channels)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> EdtFormer:
-        """Draw queries of deviation 1e-6, as published, and the rest as torch's.
+        """Draw queries with deviation 1e-6, as published, and the rest as torch does.
 
-        All layers start equal: torch's `nn.TransformerDecoder` copies the layer that it is given.
+        All layers start equal: torch's `nn.TransformerDecoder` copies the layer it is given.
         """
         queries, fc, layer_key, channels, rows = random_init.split(key, 5)
         keys = random_init.split(layer_key, 4)
@@ -207,23 +207,23 @@ class EdtFormerConfig(Aggregator):
         return EdtFormer(
             queries=random_init.normal(queries, (self.queries, self.width), scale=1e-6),
             fc=init_linear(fc, backbone.dim, self.width),
-            # Copies: a training step that donates its buffers must not find one twice.
+            # Copies: a training step that donates its buffers must not receive one twice.
             layers=tuple(jax.tree.map(jnp.copy, layer) for _ in range(self.layers)),
             channel_proj=init_linear(channels, self.width, self.channels),
             row_proj=init_linear(rows, self.queries, self.rows),
         )
 
     def apply(self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return a token of `channels` numbers for each row."""
+        """Return a token of width `channels` for each row."""
         answers = decode(params, features, self.heads)
         channels = linear(params.channel_proj, answers).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
 
 
 def decode(params: EdtFormer, features: Features, heads: int) -> Float[Array, "*batch query width"]:
-    """Ask the class token and all patches.
+    """Run the decoder, whose queries attend to the class token and all patches.
 
-    The first layer's self-attention does not depend on the image: it runs once for a whole batch.
+    The first layer's self-attention does not depend on the images: it runs once per batch.
     """
     whole = jnp.concatenate([features.class_token[..., None, :], features.patches], axis=-2)
     memory = linear(params.fc, whole)

@@ -1,6 +1,6 @@
-"""SAGE's aggregation (ICLR 2026): clusters without a transport, of features weighed by length.
+"""SAGE's aggregation (ICLR 2026): clusters without a transport, of features weighted by norm.
 
-Written from the facts of the public model; the training code is not published.
+Written from facts about the public model; the training code is not published.
 """
 
 from typing import ClassVar
@@ -28,10 +28,10 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class Sage:
-    """The networks over features, and those of the weights and of the power."""
+    """The networks over features, and those that compute the weights and the power."""
 
     weighting: TwoLayer
-    """Network of a patch's length, which says how much it counts."""
+    """Network from the L2 norm of a patch to its weight."""
     token_features: TwoLayer
     cluster_features: TwoLayer
     score: TwoLayer
@@ -45,9 +45,9 @@ class Sage:
 class SageConfig(Aggregator):
     """SAGE's aggregation (ICLR 2026).
 
-    Each cluster is a mean of the patches, weighed by a softmax of their scores; there is no dustbin
-    and no transport. The power of the clusters jumps at 0, so numbers near it are sensitive to
-    rounding.
+    Each cluster is a mean of the patches, weighted by a softmax of their scores, without a dustbin
+    or a transport. The power of the clusters is discontinuous at 0, so values near 0 are sensitive
+    to rounding.
 
     Example:
         >>> from crisalad_jax import ModelConfig
@@ -64,7 +64,7 @@ class SageConfig(Aggregator):
     hidden: PositiveInt = 512
     """Hidden width of the networks over features."""
     weighting_hidden: PositiveInt = 128
-    """Hidden width of the network of a patch's length."""
+    """Hidden width of the weighting network."""
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the tokens' shape, which does not depend on the backbone."""
@@ -85,7 +85,7 @@ class SageConfig(Aggregator):
         """Return the global token and the clusters, each L2-normalised, in float32."""
         patches = weighted(params.weighting, features.patches)
         means = pooled(params, patches)
-        # The exponent is of the image: one for all features of all clusters.
+        # An image has one exponent for all features of all clusters.
         means = means + powers(params.power, means, means.mean(axis=-2, keepdims=True))
         global_token = two_layer(params.token_features, features.class_token, 0.0, None)
         clusters = l2_normalise(means.swapaxes(-2, -1))
@@ -93,14 +93,14 @@ class SageConfig(Aggregator):
 
 
 def weighted(params: TwoLayer, patches: Patches) -> Patches:
-    """Weigh each patch by 1 to 1.5, by a network of its length."""
+    """Weight each patch by a factor of 1 to 1.5, which a network computes from its norm."""
     length = jnp.linalg.norm(at_least_float32(patches), axis=-1, keepdims=True) + 1e-6
     weights = 1 + 0.5 * jax.nn.sigmoid(two_layer(params, length, 0.0, None))
     return (at_least_float32(patches) * weights).astype(patches.dtype)
 
 
 def pooled(params: Sage, patches: Patches) -> Float[Array, "*batch feature cluster"]:
-    """Compute each cluster's mean of the features, over the number of patches once more."""
+    """Compute each cluster's weighted mean of features, divided by the number of patches."""
     features = at_least_float32(two_layer(params.cluster_features, patches, 0.0, None))
     scores = at_least_float32(two_layer(params.score, patches, 0.0, None))
     features = features - features.mean(axis=(-2, -1), keepdims=True)

@@ -36,9 +36,9 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 class Salad:
     """The three networks over features, and the transport's learnt parameters.
 
-    The published constant dustbin score has no effect: the transport's potentials absorb it, and
-    the bias of the score network's last layer too. Both have gradient 0, but public checkpoints
-    hold them.
+    The published constant dustbin score has no effect: the transport's potentials absorb it, as
+    well as the bias of the score network's last layer. Both have gradient 0, but public checkpoints
+    contain them.
     """
 
     token_features: TwoLayer
@@ -47,13 +47,13 @@ class Salad:
     dust_bin: Any
     """Learnt parameters of the dustbin, by default its score."""
     log_epsilon: Float[Array, ""] | None = None
-    """Logarithm of the entropic regularisation, where it is learnt."""
+    """Logarithm of the entropic regularisation, if it is learnt."""
     step: Any = None
     """Learnt parameters of the transport's step."""
     start: Any = None
     """Learnt parameters of the transport's start."""
     logit_tau: dict[str, Float[Array, ""]] | None = None
-    """Logits of `row_tau` and `column_tau`, where they are learnt."""
+    """Logits of `row_tau` and `column_tau`, if they are learnt."""
 
 
 _TINY = {"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dropout": 0.0}
@@ -80,17 +80,17 @@ class SaladConfig(Aggregator):
     dustbin: OrName[Dustbin] = part_field(DUSTBINS, "column")
     """Registered dustbin, or its name; it takes the patches that belong to no cluster."""
     epsilon: PositiveFloat = 1.0
-    """Entropic regularisation, by which scores are divided."""
+    """Entropic regularisation; scores are divided by it."""
     learn_epsilon: bool = False
-    """Whether epsilon is learnt, from `epsilon` as its initial value."""
+    """Whether epsilon is learnt, with `epsilon` as initial value."""
     row_tau: float = 1.0
     """1 fixes the patches' masses. Below 1 a Kullback-Leibler penalty of epsilon * tau / (1 - tau)
-    draws them to their marginals. With both sides free, high scores make masses that overflow
-    outside of logarithms."""
+    pulls them to their marginals. If both sides are free, high scores make masses overflow outside
+    the log domain."""
     column_tau: float = 1.0
-    """The same as `row_tau` for the masses of the clusters and the dustbin."""
+    """Like `row_tau`, for the masses of the clusters and the dustbin."""
     learn_tau: bool = False
-    """Whether `row_tau` and `column_tau`, where they are below 1, are learnt through a sigmoid."""
+    """Whether `row_tau` and `column_tau`, if below 1, are learnt through a sigmoid."""
     sinkhorn: SinkhornConfig = SinkhornConfig()
     """Solver of the transport."""
 
@@ -109,7 +109,7 @@ class SaladConfig(Aggregator):
         return self.clusters + self.dustbin.scores
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
-        """Require more patches than clusters, where the dustbin's mass is the difference."""
+        """Require more patches than clusters if the dustbin's mass is the difference."""
         patches = math.prod(grid)
         height, width = (patch_size * side for side in grid)
         side = patch_size * (math.isqrt(self.clusters) + 1)
@@ -125,7 +125,7 @@ class SaladConfig(Aggregator):
         return TokenShape(self.token_dim, self.clusters, self.cluster_dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Salad:
-        """Draw parameters as the public code: torch's default linears, dustbin score 1."""
+        """Draw parameters as the public code does: torch's default linears, dustbin score 1."""
         token_key, cluster_key, score_key = random_init.split(key, 3)
         dim, hidden = backbone.dim, self.hidden
         below = {name: tau for name, tau in self._taus.items() if tau < 1}
@@ -173,8 +173,8 @@ class SaladConfig(Aggregator):
     def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
 
-        The tokens carry the transport's statistics, without a gradient. A whole batch is faster
-        than `vmap`: the transport chooses the domain once for all images.
+        The tokens include the transport's statistics, without gradients. A batch is faster than
+        `vmap`: the transport chooses its domain once for all images.
 
         Raises:
             InputError: there are not more patches than clusters.
@@ -194,7 +194,7 @@ class SaladConfig(Aggregator):
 
 
 LEAST_ATTENTION = 0.01
-"""Attention below which a patch counts as one that the class token does not see, as published."""
+"""Attention below which a patch counts as unseen by the class token, as published."""
 
 
 @pytree_dataclass
@@ -202,13 +202,13 @@ class Fol(Salad):
     """SALAD's parameters, and two transposed convolutions of 3 x 3 for local features."""
 
     upconv1: Conv = dataclasses.field(kw_only=True)
-    """Makes local features for re-ranking, with `upconv2`; no descriptor needs it."""
+    """Makes local features for re-ranking, with `upconv2`; unused by descriptors."""
     upconv2: Conv = dataclasses.field(kw_only=True)
 
 
 @AGGREGATORS.register("fol", tiny={**_TINY, "local_hidden": 32, "local": 16})
 class FolConfig(SaladConfig):
-    """FoL's global descriptor: SALAD's with a dustbin of attention (Wang et al., AAAI 2025).
+    """FoL's global descriptor: SALAD's with a dustbin from attention (Wang et al., AAAI 2025).
 
     Written from the paper, with the constants of the public model.
 
@@ -226,15 +226,15 @@ class FolConfig(SaladConfig):
 
     @property
     def scores(self) -> int:
-        """Number of scores of a patch: one for each cluster. The dustbin's is no network's."""
+        """Number of scores of a patch: one per cluster. The dustbin's is not from a network."""
         return self.clusters
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches, the class token and its attention."""
+        """Request the last block's patches, the class token and its attention."""
         return FeatureSpec(class_token=True, class_attention=True)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Fol:
-        """Draw parameters as torch's default layers, as the public code."""
+        """Draw parameters as the public code does: torch's default layers."""
         *_, first, second = random_init.split(key, 5)
         return Fol(
             **vars(super().init(key, backbone, grid)),
@@ -243,7 +243,7 @@ class FolConfig(SaladConfig):
         )
 
     def dustbin_params(self, params: Fol, features: Features) -> Float[Array, "*batch patch"]:
-        """Return a score a patch: 1 minus the class token's attention to it.
+        """Return a score for each patch: 1 minus the class token's attention to it.
 
         Attention below `LEAST_ATTENTION` counts as 0.
         """

@@ -1,4 +1,4 @@
-"""SelaVPR: a generalised mean, and local features to re-rank by (Lu et al., ICLR 2024)."""
+"""SelaVPR: a generalised mean, and local features for re-ranking (Lu et al., ICLR 2024)."""
 
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -52,12 +52,12 @@ class SelaVprConfig(Aggregator):
         return TokenShape(dim, 0, dim)
 
     def local_grid(self, grid: Grid) -> tuple[int, int]:
-        """Return the rows and columns of local features over those of patches."""
+        """Return the rows and columns of local features for a grid of patches."""
         rows, columns = (SCALE * (SCALE * (side - 1)) + 1 for side in grid)
         return rows, columns
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SelaVpr:
-        """Start at an exponent of 3, with convolutions as torch's."""
+        """Draw the convolutions as torch does, and set the exponent to 3."""
         first, second = random_init.split(key)
         return SelaVpr(
             p=random_init.full((), START),
@@ -66,7 +66,7 @@ class SelaVprConfig(Aggregator):
         )
 
     def apply(self, params: SelaVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the mean of all patches; and in training, for its loss, the local features."""
+        """Return the mean of all patches and, in training, the local features for the loss."""
         tokens = Tokens.of_global(gem(features.patches, params.p))
         if key is None:
             return tokens
@@ -77,12 +77,12 @@ class SelaVprConfig(Aggregator):
 def local_features(
     params: SelaVpr | Fol, patches: Patches, grid: Grid
 ) -> Float[Array, "*batch rows columns local"]:
-    """Upsample the patch grid twice, with a ReLU between, to unit features in float32 at least.
+    """Upsample the patch grid twice, with a ReLU between, to unit features in at least float32.
 
     Args:
-        params: of the model.
-        patches: of the backbone's last layer norm.
-        grid: rows and columns of patches, of which n become 4 n - 3.
+        params: parameters of the aggregator.
+        patches: output of the backbone's last layer norm.
+        grid: rows and columns of patches; n of them become 4 n - 3.
     """
     maps = patches.reshape(-1, *grid, patches.shape[-1])
     maps = jax.nn.relu(upconv(params.upconv1, maps))
@@ -91,10 +91,10 @@ def local_features(
 
 
 def upconv(params: Conv, x: Map) -> Map:
-    """Convolve transposed, as torch's `nn.ConvTranspose2d(3, stride=2, padding=1)`.
+    """Apply a transposed convolution, as torch's `nn.ConvTranspose2d(3, stride=2, padding=1)`.
 
-    It is a convolution by the flipped kernel of `x` with zeros between its pixels. The weight has
-    the axes row, column, channel in, channel out.
+    It is a convolution of `x`, with zeros between its pixels, by the flipped kernel. The axes of
+    the weight are row, column, input channel, output channel.
     """
     assert params.bias is not None
     y = jax.lax.conv_general_dilated(

@@ -1,6 +1,6 @@
-"""SelaVPR++: a generalised mean between linear layers, and a second one of few numbers, for bits.
+"""SelaVPR++: a generalised mean between linear layers, and a second, short one for bits.
 
-Written from the facts of the public model (Lu et al. 2025, "SelaVPR++: Towards Seamless Adaptation
+Written from facts about the public model (Lu et al. 2025, "SelaVPR++: Towards Seamless Adaptation
 of Foundation Models for Efficient Place Recognition").
 """
 
@@ -36,18 +36,18 @@ class SelaVprPpConfig(Aggregator):
     """
 
     dim: PositiveInt = 2048
-    """Width of the descriptor of real numbers: 4,096 of ViT-L."""
+    """Width of the real-valued descriptor: 4,096 for ViT-L."""
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token."""
         return TokenShape(self.dim, 0, self.dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SelaVprPp:
-        """Start at an exponent of 3, with linear layers as torch's."""
+        """Draw the linear layers as torch does, and set the exponent to 3."""
         return init_head(key, backbone.dim, self.dim)
 
     def apply(self, params: SelaVprPp, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the head's output, which is scaled to unit length later."""
+        """Return the output of the head, which is scaled to unit length later."""
         return Tokens.of_global(head(params, features.patches))
 
 
@@ -56,14 +56,14 @@ class SelaVprPpHash:
     """The heads of both side paths."""
 
     real: SelaVprPp
-    """Of the first path: real numbers, which rank the first retrievals again."""
+    """Of the first path: real values, which re-rank the first retrievals."""
     hash: SelaVprPp
-    """Of the second path: the model's own descriptor, whose bits are searched."""
+    """Of the second path: the model's descriptor, for search by its bits."""
 
 
 @AGGREGATORS.register("selavprpp-hash", tiny={"dim": 256, "bits": 128})
 class SelaVprPpHashConfig(SelaVprPpConfig):
-    """SelaVPR++ with its second path: a short descriptor whose bits are searched, and re-ranking.
+    """SelaVPR++ with its second path: a short descriptor for search by its bits, and re-ranking.
 
     Example:
         >>> from crisalad_jax import ModelConfig, ViTConfig, make_part
@@ -75,7 +75,7 @@ class SelaVprPpHashConfig(SelaVprPpConfig):
     """
 
     bits: PositiveInt = 512
-    """Width of the descriptor, and so number of its bits."""
+    """Width of the descriptor, and number of its bits."""
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the last patches of the second side path."""
@@ -98,7 +98,7 @@ class SelaVprPpHashConfig(SelaVprPpConfig):
 
 
 def init_head(key: PRNGKeyArray, dim: int, width: int) -> SelaVprPp:
-    """Draw a head of `width` numbers over features of width `dim`."""
+    """Draw a head that maps features of width `dim` to `width` outputs."""
     first, second = random_init.split(key)
     exponent = random_init.full((), START)
     return SelaVprPp(exponent, init_linear(first, dim, dim), init_linear(second, dim, width))
@@ -107,7 +107,7 @@ def init_head(key: PRNGKeyArray, dim: int, width: int) -> SelaVprPp:
 def head(params: SelaVprPp, patches: Patches) -> Float[Array, "*batch width"]:
     """Apply a linear layer, the generalised mean of unit patches and a linear layer.
 
-    The result is float32 at least, and of any length.
+    The result is at least float32, and not normalised.
     """
     mean = gem(linear(params.before, patches), params.p).astype(patches.dtype)
     return at_least_float32(linear(params.after, mean))

@@ -1,6 +1,6 @@
 """TransVPR's multi-level attention (Wang et al., CVPR 2022, section 3.2), on any of our backbones.
 
-Features hold the patches of all levels side by side (`FeatureSpec.levels`).
+Features hold the concatenated patches of all levels (`FeatureSpec.levels`).
 """
 
 import jax
@@ -16,12 +16,12 @@ from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 KEY_THRESHOLD = 0.02
-"""Fused attention, from 0 to 1, above which the public code has key patches."""
+"""Fused attention, from 0 to 1, above which the public code selects key patches."""
 
 
 @pytree_dataclass
 class TransVpr:
-    """The layer of a patch's scores for every level, and the descriptor's linear layer."""
+    """The layer that scores patches for every level, and the linear layer of the descriptor."""
 
     attention: Linear
     """Score layer without bias, which a softmax over patches would cancel."""
@@ -30,15 +30,15 @@ class TransVpr:
 
 @AGGREGATORS.register("transvpr", tiny={"levels": 2, "dim": 128})
 class TransVprConfig(Aggregator):
-    """TransVPR: patches of several layers, weighed by attention (Wang et al., CVPR 2022)."""
+    """TransVPR: patches of several layers, weighted by attention (Wang et al., CVPR 2022)."""
 
     levels: PositiveInt = 3
-    """Number of the backbone's layers that are used, evenly spaced, with the last one."""
+    """Number of the backbone's layers that are used, evenly spaced up to the last."""
     dim: PositiveInt = 256
     """Width of the descriptor."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request the patches after several numbers of blocks."""
+        """Request the patches of several, evenly spaced blocks."""
         require_range(self, 1, depth, "levels")
         numbers = range(1, self.levels + 1)
         return FeatureSpec(tuple(depth * number // self.levels for number in numbers))
@@ -56,7 +56,7 @@ class TransVprConfig(Aggregator):
         )
 
     def apply(self, params: TransVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the global descriptor, and no local token."""
+        """Return the global descriptor, without local tokens."""
         patches = at_least_float32(features.patches)
         weights = attentions(params, features.patches)
         by_level = patches.reshape(*patches.shape[:-1], self.levels, -1)
@@ -66,18 +66,18 @@ class TransVprConfig(Aggregator):
 
 
 def attentions(params: TransVpr, patches: Patches) -> Float[Array, "*batch patch level"]:
-    """Compute a softmax over patches for every level, from all levels, in float32 at least."""
+    """Compute a softmax over patches for every level, from all levels, in at least float32."""
     return jax.nn.softmax(at_least_float32(linear(params.attention, patches)), axis=-2)
 
 
 def key_features(
     params: TransVpr, patches: Float[Array, "*batch patch wide"], levels: int
 ) -> Patches:
-    """Return the patch tokens of the middle level, and 0 for patches that are no key patches.
+    """Return the patch tokens of the middle level, and 0 for patches that are not key patches.
 
-    Every level's attention is rescaled to 0 to 1, and so is their sum. Key patches are those above
-    `KEY_THRESHOLD`. As in the public code, tokens are no unit vectors, and no layer is learnt for
-    them alone.
+    The attention of every level is rescaled to the range 0 to 1, and so is their sum. Key patches
+    are those above `KEY_THRESHOLD`. As in the public code, tokens are not unit vectors, and no
+    extra layer is learnt for them.
     """
     fused = _stretch(_stretch(attentions(params, patches)).sum(axis=-1, keepdims=True))
     middle = jnp.split(at_least_float32(patches), levels, axis=-1)[levels // 2]
@@ -85,6 +85,6 @@ def key_features(
 
 
 def _stretch(x: Float[Array, "*batch patch level"]) -> Float[Array, "*batch patch level"]:
-    """Rescale the patches' numbers to 0 to 1, or to 0 where they are all the same."""
+    """Rescale the values of patches to the range 0 to 1, or to 0 if all are equal."""
     low, high = x.min(axis=-2, keepdims=True), x.max(axis=-2, keepdims=True)
     return (x - low) / jnp.maximum(high - low, 1e-12)

@@ -1,6 +1,6 @@
 """Sums of patches, or of their residuals, by cluster: NetVLAD, SuperVLAD, VLAD-BuFF and AnyLoc.
 
-All compute in float32 at least, at the highest precision.
+All of them compute in at least float32, at the highest precision.
 """
 
 import abc
@@ -41,7 +41,7 @@ BURST = (8.0, 7.0, 1.0)
 
 @dataclasses.dataclass(frozen=True)
 class VladConfig(Aggregator):
-    """What these aggregators share: a local token for each cluster, as wide as the backbone."""
+    """Base class of these aggregators: one local token per cluster, as wide as the backbone."""
 
     clusters: PositiveInt = 64
 
@@ -55,14 +55,14 @@ class VladConfig(Aggregator):
 
     @abc.abstractmethod
     def sums(self, params: Any, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Return a sum for each cluster of unit patches in float32 at least.
+        """Return a sum of unit patches for each cluster, in at least float32.
 
-        All products are of the highest precision: a small difference of scores or distances can
-        move a patch to another cluster.
+        All products use the highest precision: a small difference in scores or distances can move a
+        patch to another cluster.
         """
 
     def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the sum of each cluster, and no global token."""
+        """Return the sum of each cluster, without a global token."""
         patches = l2_normalise(at_least_float32(features.patches))
         return Tokens.of_local(self.sums(params, patches))
 
@@ -85,7 +85,7 @@ class NetVladConfig(VladConfig):
     """NetVLAD (Arandjelovic et al., CVPR 2016)."""
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> NetVlad:
-        """Draw unit vectors as centroids. `training.vocabulary` makes centroids from images."""
+        """Draw unit vectors as centroids. `training.vocabulary` computes them from images."""
         conv_key, centroid_key = random_init.split(key)
         dim = backbone.dim
         return NetVlad(
@@ -98,7 +98,7 @@ class NetVladConfig(VladConfig):
         return NetVlad(scores_from_centroids(centroids, features), centroids)
 
     def sums(self, params: NetVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Sum residuals by Eq. 4, then intra-normalise (Arandjelovic, Zisserman 2013)."""
+        """Sum residuals as in Eq. 4, then intra-normalise (Arandjelovic, Zisserman 2013)."""
         return l2_normalise(residual_sums(shares(params.conv, patches), patches, params.centroids))
 
 
@@ -124,14 +124,14 @@ class SuperVladConfig(VladConfig):
     centroid_images: ClassVar[int] = 5000
     clusters: PositiveInt = 4
     ghosts: NonNegativeInt = 1
-    """Number of clusters that take part in the softmax, and are dropped after it."""
+    """Number of clusters that take part in the softmax and are dropped after it."""
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SuperVlad:
-        """Draw the scores' layer as torch's convolution."""
+        """Draw the score layer as torch draws convolutions."""
         return SuperVlad(init_linear(key, backbone.dim, self.clusters + self.ghosts, bias=False))
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> SuperVlad:
-        """Make the scores as NetVLAD's; the centroids themselves are not kept."""
+        """Make the score layer as in NetVLAD; the centroids themselves are not stored."""
         return SuperVlad(scores_from_centroids(centroids, features))
 
     def count_centroids(self, dim: int) -> int:
@@ -139,7 +139,7 @@ class SuperVladConfig(VladConfig):
         return self.clusters + self.ghosts
 
     def sums(self, params: SuperVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Sum patches by their shares in the clusters, then normalise each sum, then all."""
+        """Sum patches weighted by their shares, then normalise each sum, then all together."""
         parts = shares(params.conv, patches)[..., : self.clusters]
         sums = l2_normalise(jnp.einsum("...pk,...pd->...kd", parts, patches, precision="highest"))
         return l2_normalise(sums.reshape(*sums.shape[:-2], -1)).reshape(sums.shape)
@@ -147,7 +147,7 @@ class SuperVladConfig(VladConfig):
 
 @pytree_dataclass
 class Reduction:
-    """Fewer dimensions of a unit patch: `(patch - mean) @ rotation`."""
+    """Dimensionality reduction of a unit patch: `(patch - mean) @ rotation`."""
 
     mean: Float[Array, " dim"]
     rotation: Float[Array, "dim reduced"]
@@ -155,7 +155,7 @@ class Reduction:
 
 @pytree_dataclass
 class VladBuff:
-    """NetVLAD's parameters, those of the burst weights, and the reduction before them."""
+    """The reduction, NetVLAD's parameters after it, and those of the burst weights."""
 
     reduction: Reduction | None
     conv: Linear
@@ -176,7 +176,7 @@ class VladBuffConfig(VladConfig):
     """
 
     reduced: NonNegativeInt = 192
-    """Width of a patch after the reduction; 0 leaves the reduction out."""
+    """Width of a patch after the reduction; 0 disables the reduction."""
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one sum of residuals for each cluster."""
@@ -196,7 +196,7 @@ class VladBuffConfig(VladConfig):
         )
 
     def centroid_features(self, features: FeatureRows) -> Float[Array, "feature reduced"]:
-        """Return the features reduced by their principal components, at their own lengths.
+        """Reduce the features to their principal components, without normalising them again.
 
         Raises:
             InputError: there are fewer features than components.
@@ -208,13 +208,13 @@ class VladBuffConfig(VladConfig):
     def from_centroids(
         self, centroids: Float[Array, "cluster reduced"], features: FeatureRows
     ) -> VladBuff:
-        """Make the reduction of principal components, and NetVLAD's start of reduced features."""
+        """Fit the reduction by PCA, and make NetVLAD's parameters from the reduced features."""
         reduction = fit_reduction(features, self.reduced) if self.reduced else None
         conv = scores_from_centroids(centroids, self.centroid_features(features))
         return VladBuff(reduction, conv, centroids, jnp.asarray(BURST))
 
     def sums(self, params: VladBuff, patches: Patches) -> Float[Array, "*batch cluster reduced"]:
-        """Reduce patches, and sum their residuals by shares over burst weights."""
+        """Reduce patches, and sum their residuals weighted by shares / burst weights."""
         if params.reduction is not None:
             patches = l2_normalise(reduce_features(params.reduction, patches))
         weighed = shares(params.conv, patches) / burst_weights(params.burst, patches)[..., None]
@@ -230,7 +230,7 @@ class Words:
 
 
 class WordsConfig(VladConfig):
-    """What sums by the nearest visual word share: words that k-means alone finds."""
+    """Base class of sums by the nearest visual word, whose words come only from k-means."""
 
     trainable: ClassVar[bool] = False
 
@@ -245,18 +245,18 @@ class WordsConfig(VladConfig):
 
 @AGGREGATORS.register("anyloc", tiny={"clusters": 16, "layer": -1})
 class AnyLocConfig(WordsConfig):
-    """AnyLoc: hard VLAD of a facet of one layer, nothing learnt (Keetha et al., RA-L 2023)."""
+    """AnyLoc: hard VLAD on a facet of one layer, without training (Keetha et al., RA-L 2023)."""
 
     clusters: PositiveInt = 32
     """Number of words of the vocabulary, which `crisalad vocabulary` builds."""
     layer: int = -9
-    """Block of the facet, from 0, or from the end where negative: -9 is block 31 of ViT-g's 40,
+    """Block of the facet, from 0, or from the end if negative: -9 is block 31 of ViT-g's 40,
     AnyLoc's choice."""
     facet: Literal["query", "key", "value", "token"] = "value"
     """Facet of the block: queries, keys or values of its attention, or its output tokens."""
     assignment: Literal["cosine", "euclidean"] = "cosine"
-    """What the nearest word of a patch is nearest by. The public code takes the angle; so does the
-    k-means that builds a vocabulary."""
+    """How the nearest word of a patch is found. The public code uses the angle; so does the k-means
+    that builds a vocabulary."""
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the facet, without the last layer norm.
@@ -275,8 +275,8 @@ class AnyLocConfig(WordsConfig):
     def sums(self, params: Words, patches: Patches) -> Float[Array, "*batch cluster dim"]:
         """Compute VLAD (Jegou et al. 2010): residuals from the nearest word, intra-normalised.
 
-        Residuals are from the words as they are, whatever their lengths. A sum is 0 where no patch
-        is near.
+        Words are not normalised before the subtraction. A word's sum is 0 if it is nearest to no
+        patch.
         """
         nearest = nearest_words(params.words, patches, self.assignment)
         one_hot = jax.nn.one_hot(nearest, len(params.words), dtype=patches.dtype)
@@ -284,23 +284,23 @@ class AnyLocConfig(WordsConfig):
 
 
 def scores_from_centroids(centroids: Centroids, features: FeatureRows) -> Linear:
-    """Make the scores' layer as the authors do: alpha times cosines to the k-means centroids.
+    """Make the score layer as the authors do: alpha times cosines to the k-means centroids.
 
     alpha is chosen so that a feature's largest share is `RATIO` times its second largest, in the
     geometric mean over these features.
 
     Args:
-        centroids: of the features, two or more.
-        features: unit vectors, or what the centroids are of.
+        centroids: two or more centroids of the features.
+        features: unit vectors, or the vectors that the centroids were computed from.
 
     Raises:
-        InputError: all features are as near to two centroids, as where all are alike.
+        InputError: all features are equally near to two centroids, for example if all are equal.
     """
     directions = l2_normalise(centroids)
     cosines = jnp.matmul(features, directions.T, precision="highest")
     best = jax.lax.top_k(cosines, 2)[0]
     gap = float((best[:, 0] - best[:, 1]).mean())
-    # Below this the two differ by rounding alone.
+    # Below this the two differ only by rounding.
     if not gap > 1e-6:
         raise InputError(
             f"features: found {len(features)} that are as near to two of {len(centroids)} "
@@ -318,7 +318,7 @@ def shares(conv: Linear, patches: Patches) -> Float[Array, "*batch patch cluster
 def residual_sums(
     shares: Float[Array, "*batch patch cluster"], patches: Patches, centroids: Centroids
 ) -> Float[Array, "*batch cluster dim"]:
-    """Sum, for each cluster, all patches' residuals from it, weighted by their shares.
+    """Sum the residuals of all patches from each cluster, weighted by their shares.
 
     This is the weighted sum of the patches minus the centroid times the sum of the shares.
     """
@@ -330,7 +330,7 @@ def fit_reduction(features: FeatureRows, reduced: int) -> Reduction:
     """Fit the mean and the first principal components of features, without whitening.
 
     Args:
-        features: at least `reduced` of them, and at least so wide.
+        features: at least `reduced` of them, and at least that wide.
         reduced: number of components.
 
     Raises:
@@ -344,19 +344,19 @@ def fit_reduction(features: FeatureRows, reduced: int) -> Reduction:
     mean = features.mean(axis=0)
     centred = features - mean
     scatter = jnp.matmul(centred.T, centred, precision="highest")
-    # Eigenvalues rise.
+    # Eigenvalues are in ascending order.
     return Reduction(mean, jnp.linalg.eigh(scatter)[1][:, ::-1][:, :reduced])
 
 
 def reduce_features(
     reduction: Reduction, features: Float[Array, "*batch feature dim"]
 ) -> Float[Array, "*batch feature reduced"]:
-    """Reduce features to fewer dimensions, in which they are no unit vectors."""
+    """Reduce features to fewer dimensions. The results are not unit vectors."""
     return jnp.matmul(features - reduction.mean, reduction.rotation, precision="highest")
 
 
 def burst_weights(burst: Float[Array, "3"], patches: Patches) -> Float[Array, "*batch patch"]:
-    """Count, softly, the patches that are like each: sigmoids of squared distances, summed.
+    """Count the patches similar to each, softly: sum sigmoids of squared distances.
 
     Args:
         burst: slope a, offset b and power p of (sum over j of sigmoid(b - a |x_i - x_j|^2))^p.
@@ -371,7 +371,7 @@ def burst_weights(burst: Float[Array, "3"], patches: Patches) -> Float[Array, "*
 def nearest_words(
     words: Centroids, patches: Patches, assignment: Literal["cosine", "euclidean"]
 ) -> Int[Array, "*batch patch"]:
-    """Find the word nearest to every unit patch, by the angle or the distance."""
+    """Find the word nearest to every unit patch, by angle or distance."""
     if assignment == "cosine":
         return jnp.argmax(jnp.matmul(patches, l2_normalise(words).T, precision="highest"), axis=-1)
     products = jnp.matmul(patches, words.T, precision="highest")

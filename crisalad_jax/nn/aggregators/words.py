@@ -1,6 +1,6 @@
-"""Visual words that nothing learns but k-means: VLAD, and bags of words.
+"""VLAD and bags of words, with visual words learnt only by k-means.
 
-Patches of zeros are none: an image may have fewer features than there is room for.
+Patches of zeros are ignored: an image may have fewer features than there is room for.
 """
 
 from collections.abc import Sequence
@@ -32,9 +32,9 @@ class HardVladConfig(WordsConfig):
     """VLAD (Jegou et al., CVPR 2010), intra-normalised (Arandjelovic and Zisserman, CVPR 2013)."""
 
     def sums(self, params: Words, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Sum residuals from the nearest word, each cluster's at length 1.
+        """Sum residuals from the nearest word, and normalise the sum of each cluster.
 
-        An image without any has equal numbers.
+        An image without features gets equal values.
         """
         shares = word_shares(params.words, patches)
         sums = l2_normalise(residual_sums(shares, patches, params.words))
@@ -43,12 +43,12 @@ class HardVladConfig(WordsConfig):
 
 @pytree_dataclass
 class Bow:
-    """The visual words, and what each counts."""
+    """The visual words and their weights."""
 
     words: Centroids
-    """k-means centroids of unit features; of binary ones majorities of bits."""
+    """k-means centroids of unit features; for binary ones bit majorities."""
     weights: Float[Array, " cluster"]
-    """log(N / n) of a word that n of the N images of the vocabulary have."""
+    """log(N / n) of a word that n of the N vocabulary images contain."""
 
 
 @AGGREGATORS.register("bow", tiny={"clusters": 100})
@@ -60,7 +60,7 @@ class BowConfig(Aggregator):
     """Number of words of the vocabulary, which `crisalad vocabulary` builds."""
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of a global token with a number for each word."""
+        """Return the shape of a global token with a dimension for each word."""
         return TokenShape(self.clusters, 0, self.clusters)
 
     def count_centroids(self, dim: int) -> int:
@@ -68,24 +68,24 @@ class BowConfig(Aggregator):
         return self.clusters
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Bow:
-        """Draw random unit vectors as words that count alike, until a vocabulary is built."""
+        """Draw random unit vectors as words of equal weight, until a vocabulary is built."""
         words = l2_normalise(random_init.normal(key, (self.clusters, backbone.dim)))
         return Bow(words, random_init.ones(self.clusters))
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Bow:
-        """Use the centroids as words; `with_frequencies` weighs them."""
+        """Use the centroids as words; `with_frequencies` weights them."""
         return Bow(centroids, jnp.ones(len(centroids)))
 
     def with_frequencies(self, params: Bow, images: Sequence[np.ndarray]) -> Bow:
-        """Return the words with the weights log(N / n) of these images' features."""
+        """Return the words, weighted by log(N / n) over the features of these images."""
         has = [word_shares(params.words, jnp.asarray(each)).any(axis=0) for each in images]
         count = np.maximum(np.sum(has, axis=0), 1)
         return Bow(params.words, jnp.log(jnp.asarray(len(images) / count, jnp.float32)))
 
     def apply(self, params: Bow, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the share of an image's patches that have each word, times the word's weight.
+        """Return each word's share of the patches of an image, times the word's weight.
 
-        An image without any has equal numbers.
+        An image without features gets equal values.
         """
         patches = l2_normalise(at_least_float32(features.patches))
         counts = word_shares(params.words, patches).sum(axis=-2)
@@ -94,7 +94,7 @@ class BowConfig(Aggregator):
 
 
 def word_shares(words: Centroids, patches: Patches) -> Float[Array, "*batch patch cluster"]:
-    """Return 1 for each unit patch's nearest word; patches of zeros have none."""
+    """Return 1 for the nearest word of each unit patch; patches of zeros get all zeros."""
     nearest = jax.nn.one_hot(nearest_words(words, patches, "euclidean"), len(words))
     return nearest * patches.any(axis=-1, keepdims=True)
 

@@ -27,14 +27,14 @@ class Features(NamedTuple):
     """The features of a batch, or of one of its images."""
 
     class_token: Float[Array, "*batch dim"]
-    """One vector for the whole image; of width 0 where the backbone has none."""
+    """One vector for the whole image, of width 0 if the backbone has none."""
     patches: Patches
     """One vector for each patch, in row order."""
     inserted: Float[Array, "*batch inserted dim"] | None = None
-    """One vector for each of `FeatureSpec.inserted`; None without them."""
+    """One vector for each of `FeatureSpec.inserted`; None without any."""
     class_attention: Float[Array, "*batch patch"] | None = None
-    """Share of each patch in the class token's attention, summed over the last block's heads, in
-    float32 at least; None where `FeatureSpec.class_attention` does not ask for it."""
+    """Attention of the class token to each patch, summed over the heads of the last block, in at
+    least float32; None unless `FeatureSpec.class_attention` requests it."""
 
 
 @short_repr()
@@ -43,30 +43,30 @@ class FeatureSpec:
     """The features that an aggregator requests; by default those after the last layer."""
 
     levels: tuple[int, ...] | None = None
-    """Numbers of blocks, from 1, after which patches are taken and concatenated. Several must
-    include the last block. None takes the last alone."""
+    """Blocks, counted from 1, whose output patches are concatenated. Several must include the last
+    block. None takes only the last."""
     facet: Literal["token", "query", "key", "value"] = "token"
-    """Facet of the level's last block: its output tokens, or queries, keys or values of its
-    attention, with the heads side by side."""
+    """Facet of the level's block: its output tokens, or queries, keys or values of its attention,
+    with the heads concatenated."""
     norm: bool = True
-    """Whether tokens go through the last layer norm."""
+    """Whether the last layer norm is applied."""
     class_token: bool = False
-    """Whether the class token is used, which not every backbone has."""
+    """Whether the class token is used. Not every backbone has one."""
     class_attention: bool = False
     """Whether the class token's attention in the last block is used."""
     path: int = 0
-    """Number of the adapters' side path, from 0, whose tokens are the features."""
+    """Index of the adapters' side path whose tokens are the features."""
     insertion: int | None = None
-    """Number of blocks after which the aggregator's own tokens are put in front of all others.
-    None where it has none."""
+    """Number of blocks after which the aggregator's own tokens are prepended to all others. None
+    if it has none."""
     inserted: Float[Array, "inserted dim"] | None = None
-    """Those tokens, the same for every image; `Aggregator.inserted` returns them."""
+    """Those tokens, the same for every image, from `Aggregator.inserted`."""
 
     def levels_of(self, depth: int) -> tuple[int, ...]:
-        """Return the levels in a backbone of so many blocks.
+        """Return the levels in a backbone of `depth` blocks.
 
         Raises:
-            InputError: they are not in order, more than there are blocks, or several of a facet.
+            InputError: the levels are out of order or above `depth`, or a facet has several.
         """
         levels = (depth,) if self.levels is None else self.levels
         in_order = list(levels) == sorted(set(levels)) and 0 < levels[0] <= levels[-1] <= depth
@@ -80,9 +80,9 @@ class FeatureSpec:
 
 @dataclasses.dataclass(frozen=True)
 class Backbone(Part, abc.ABC):
-    """A network from pixels to features: a frozen dataclass whose fields are its settings.
+    """A network that turns pixels into features: a frozen dataclass whose fields are its settings.
 
-    A backbone has at least `dim`, `depth` and `patch_size`, and the two methods that are abstract.
+    A backbone has at least `dim`, `depth` and `patch_size`, and implements both abstract methods.
     """
 
     dim: PositiveInt = 768
@@ -90,36 +90,36 @@ class Backbone(Part, abc.ABC):
     depth: PositiveInt = 12
     """Number of blocks, or levels."""
     patch_size: ClassVar[int] = 14
-    """Side of a patch in pixels; sides of images are multiples of it."""
+    """Side of a patch in pixels; the sides of images are multiples of it."""
     any_size: ClassVar[bool] = False
-    """Whether sides of images may be of any length."""
+    """Whether images may have any size."""
     class_token: ClassVar[bool] = True
-    """Whether its features have a class token."""
+    """Whether its features include a class token."""
     supports_prompt_tokens: ClassVar[bool] = False
     """Whether an aggregator's own tokens can run through its blocks."""
     exposes_cls_attention: ClassVar[bool] = False
-    """Whether its features can have the class token's attention, or facets of attention."""
+    """Whether its features can include the class token's attention, or facets of attention."""
     exposes_levels: ClassVar[bool] = True
-    """Whether its features can be those after other blocks than the last."""
+    """Whether features can be taken after blocks other than the last."""
     local_features: ClassVar[str | None] = None
-    """Features that photographs become on the host, in place of pixels: "sift" or "orb"."""
+    """Features that the host extracts from photographs to replace pixels: "sift" or "orb"."""
     binary: ClassVar[bool] = False
-    """Whether the numbers of its features have two values, as those of visual words then have."""
+    """Whether its features take only two values, as their visual words then do too."""
     encoded_size: ClassVar[tuple[int, int] | None] = None
-    """Height and width of the bytes of `local_features`; None where it takes pixels."""
+    """Height and width of the byte array of `local_features`; None if it takes pixels."""
     side_paths: ClassVar[int] = 1
-    """Number of side paths of its adapters; 1 where there are none."""
+    """Number of side paths of its adapters; 1 if there are none."""
     extras: ClassVar[str] = ""
-    """Settings that one line about a model names, each after a comma."""
+    """Settings for a one-line summary of a model, each after a comma."""
     trains: ClassVar[tuple[str, ...]] = ()
-    """Names, or patterns of names, of parameters that are there to be trained.
+    """Names, or name patterns, of the parameters that are meant to be trained.
 
-    They are those of adapters, in the names of `init`, such as "blocks.*.adapter" or "lora". A run
-    that trains none of them is refused, unless it says so (`--trainable head,-adapters`)."""
+    They are those of adapters, named as in `init`, such as "blocks.*.adapter" or "lora". A run that
+    trains none of them is refused unless it asks for that (`--trainable head,-adapters`)."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:
-        """Draw random parameters, a pytree of arrays in float32."""
+        """Draw random parameters, a pytree of float32 arrays."""
 
     @abc.abstractmethod
     def apply(
@@ -128,30 +128,30 @@ class Backbone(Part, abc.ABC):
         """Return the features of normalised images, and the parameters.
 
         Args:
-            params: of `init`, or of `split_blocks`.
-            images: with sides that are multiples of `patch_size`, in the type to compute in.
+            params: from `init` or `split_blocks`.
+            images: with sides that are multiples of `patch_size`, in the dtype of the computation.
             request: the features to return.
-            remat: `ModelConfig.remat`.
-            valid: images of a training batch, whose statistics batch norms normalise by
-                (`layers.train_batch_norm`). None takes the stored ones, which stay.
+            remat: see `ModelConfig.remat`.
+            valid: mask of the training images whose statistics the batch norms use
+                (`layers.train_batch_norm`). None uses the stored ones, without updating them.
 
         Returns:
-            (features, updated): the parameters with updated running statistics, if there are any.
-            In the place of all other leaves there may be None.
+            (features, updated): the second is the parameters, with any running statistics updated.
+            All other leaves may be None.
 
         Raises:
-            InputError: while tracing, for a request that this backbone cannot meet.
+            InputError: during tracing, if the backbone cannot meet the request.
         """
 
     def split_blocks(self, params: Any, cuts: Sequence[int]) -> Any:
-        """Return parameters whose stack `params.blocks` is cut before the blocks of these numbers.
+        """Return parameters with the stack `params.blocks` cut before the blocks of these indices.
 
-        It is needed where leaves of `params.blocks` have a leading axis of `depth` blocks: training
-        cuts it so that some blocks train and no gradient runs through frozen ones before them. The
-        parts are a tuple, and `apply` accepts both forms.
+        Implement it if leaves of `params.blocks` have a leading axis of `depth` blocks. Training
+        cuts the stack so that some blocks train and no gradient passes through frozen ones before
+        them. The parts form a tuple; `apply` accepts both forms.
 
         Raises:
-            InputError: this backbone has no blocks to cut.
+            InputError: the backbone has no blocks to cut.
         """
         raise InputError(
             f"trainable: found a part of the blocks of backbone {self.part_name}, which cannot be "
@@ -163,22 +163,22 @@ class Backbone(Part, abc.ABC):
         return params
 
     def merge_adapters(self, params: Any) -> tuple[Any, Any]:
-        """Return (backbone, params) without adapters that compute the same; see `merge_adapters`.
+        """Return an equivalent (backbone, params) without adapters; see `merge_adapters`.
 
         Raises:
-            InputError: this backbone has no adapters, or they cannot be merged.
+            InputError: the backbone has no adapters, or they cannot be merged.
         """
         raise InputError(
             f"merge_adapters: found backbone {self.part_name}, expected one with adapters, as vit"
         )
 
     def adapt_checkpoint(self, config: Any, params: Any, fresh: Any) -> tuple[Any, Any]:
-        """Return another's configuration and parameters, changed as far as this one can do with.
+        """Adapt another backbone's configuration and parameters to this one where possible.
 
         Args:
             config: another backbone of this class.
-            params: its parameters.
-            fresh: parameters of this backbone, for what the other's lack.
+            params: parameters of that backbone.
+            fresh: parameters of this backbone, to use where the other's do not fit.
         """
         return config, params
 
@@ -186,7 +186,7 @@ class Backbone(Part, abc.ABC):
         """Return the rows and columns of patches in an image of this height and width.
 
         Raises:
-            InputError: a side is no multiple of `patch_size`.
+            InputError: a side is not a multiple of `patch_size`.
         """
         height, width = image_size
         size = self.patch_size

@@ -1,8 +1,8 @@
-"""DINOv3's vision transformer ViT/16 (Siméoni et al. 2025), in inference without augmentation.
+"""DINOv3's vision transformer ViT/16 (Siméoni et al. 2025), as in inference, without augmentation.
 
-Written from the paper and the behaviour of Hugging Face's DINOv3ViTModel, whose outputs it meets.
-What differs from DINOv2: patches of 16 x 16, positions by rotation, no bias of the keys, and the
-layer norms' epsilon.
+Written from the paper and the behaviour of Hugging Face's DINOv3ViTModel, whose outputs it
+reproduces. Differences from DINOv2: patches of 16 x 16, rotary positions, no bias of the keys, and
+the epsilon of the layer norms.
 """
 
 import functools
@@ -18,7 +18,7 @@ from crisalad_jax.nn.backbones.vit import Block, VisionTransformer
 from crisalad_jax.nn.layers import Linear
 
 PERIOD_BASE = 100.0
-"""Ratio that the longest period approaches; the shortest is 1, half the side of an image."""
+"""Limit of the longest period; the shortest is 1, which is half the side of an image."""
 
 
 @BACKBONES.register(
@@ -31,8 +31,8 @@ PERIOD_BASE = 100.0
 class DinoV3Config(VisionTransformer):
     """A DINOv3 vision transformer with patches of 16 x 16 (Siméoni et al. 2025).
 
-    Queries and keys are rotated by their patch's row and column. By default it is ViT-B/16. In the
-    preset g14 it is ViT-H+/16, the largest that is distilled.
+    Queries and keys are rotated by the row and column of their patch. The default is ViT-B/16. The
+    preset g14 is ViT-H+/16, the largest distilled model.
     """
 
     patch_size: ClassVar[int] = 16
@@ -47,13 +47,13 @@ class DinoV3Config(VisionTransformer):
         require_field(self, "heads", fits, f"a divisor of a fourth of dim ({self.dim})")
 
     def rotation(self, grid: Grid) -> Rotation:
-        """Return the patches' angles; see `rotary_angles`."""
+        """Return the rotation angles of the patches; see `rotary_angles`."""
         return _rotation(grid, self.dim // self.heads)
 
     def attention_of(self, layer: Block) -> Attention:
-        """Return a block's attention with a bias of 0 for keys, which then has no gradient.
+        """Return a block's attention with the bias of keys set to 0, so that it has no gradient.
 
-        Among rotated keys a bias would not cancel in the softmax.
+        With rotated keys a bias would not cancel in the softmax.
         """
         qkv = layer.attn.qkv
         assert qkv.bias is not None
@@ -63,15 +63,15 @@ class DinoV3Config(VisionTransformer):
 
 
 def rotary_periods(head_dim: int) -> np.ndarray:
-    """Return a head's periods, head_dim / 4 of them: from 1 towards `PERIOD_BASE`."""
+    """Return the head_dim / 4 periods of a head, from 1 towards `PERIOD_BASE`."""
     return PERIOD_BASE ** (np.arange(head_dim // 4) * 4 / head_dim)
 
 
 def rotary_angles(grid: Grid, head_dim: int) -> np.ndarray:
-    """Compute the angles of each patch: those of its row, and then those of its column.
+    """Compute the angles of each patch: first those of its row, then those of its column.
 
-    An angle is 2 pi x / period. A patch's centre has x from -1 to 1 along either side of the image,
-    whatever their lengths.
+    An angle is 2 pi x / period, where x is the position of the patch's centre along a side of the
+    image, which spans -1 to 1 whatever its length.
 
     Args:
         grid: rows and columns of patches.
@@ -95,6 +95,6 @@ def rotary_angles(grid: Grid, head_dim: int) -> np.ndarray:
 
 @functools.cache
 def _rotation(grid: Grid, head_dim: int) -> Rotation:
-    """Compute cosines and sines, in float64 on the host: they are constants of the program."""
+    """Compute cosines and sines in float64 on the host, as constants of the program."""
     angles = rotary_angles(grid, head_dim)
     return Rotation(np.cos(angles), np.sin(angles))

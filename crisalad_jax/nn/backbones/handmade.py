@@ -1,4 +1,4 @@
-"""Backbones that nothing trains: features that people defined, of one width."""
+"""Backbones without training: hand-crafted features of a fixed width."""
 
 import abc
 import dataclasses
@@ -12,22 +12,22 @@ from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
 
 @dataclasses.dataclass(frozen=True)
 class HandmadeBackbone(Backbone):
-    """A backbone without parameters, whose width is its class's."""
+    """A backbone without parameters, whose width is fixed by its class."""
 
     depth: int = 1
 
     def __post_init__(self) -> None:
-        """Check that its sizes are the only ones."""
+        """Check that `dim` and `depth` have their only valid values."""
         width = type(self).dim
         require_range(self, width, width, "dim")
         require_range(self, 1, 1, "depth")
 
     def init(self, key: PRNGKeyArray) -> None:
-        """Return no parameters."""
+        """Return None: there are no parameters."""
 
 
 class WholeImageBackbone(HandmadeBackbone):
-    """A descriptor of a whole image of one size."""
+    """A whole-image descriptor for images of one size."""
 
     size: ClassVar[tuple[int, int]]
     """Height and width in pixels."""
@@ -48,6 +48,6 @@ class WholeImageBackbone(HandmadeBackbone):
     def apply(
         self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, None]:
-        """Return the descriptor as the class token, and as the only patch."""
+        """Return the descriptor as both the class token and the only patch."""
         descriptors = self.descriptors(images)
         return Features(descriptors, descriptors[:, None]), None

@@ -14,17 +14,17 @@ _CELLS = _SIDE // _CELL
 _BINS = 9
 _DIM = (_CELLS - 1) ** 2 * 4 * _BINS
 _GREY = (9798, 19235, 3735)
-"""Shares of red, green and blue in 2^15 parts, by which OpenCV makes a picture grey (BT.601)."""
+"""Weights of red, green and blue, times 2^15, with which OpenCV converts to grey (BT.601)."""
 
 
 @BACKBONES.register("hog")
 class HogConfig(WholeImageBackbone):
     """Histograms of oriented gradients of 128 x 128 pixels (Dalal and Triggs, CVPR 2005).
 
-    Pictures are grey, with Sobel gradients. Unsigned angles fall into 9 bins, linearly between the
-    two nearest. Cells have 8 x 8 pixels. Blocks of 2 x 2 cells, one cell apart, are divided by
-    their L2 norms. A picture without gradients gets equal values. There are no parameters: the
-    class token is the descriptor. Images are bytes, with a mean of 0 and a deviation of 1/255.
+    Sobel gradients of the grey image vote, by unsigned angle, linearly for the two nearest of 9
+    bins. Cells have 8 x 8 pixels. Blocks of 2 x 2 cells, one cell apart, are divided by their L2
+    norms. An image without gradients gets equal values. There are no parameters: the class token is
+    the descriptor. Preprocessing needs bytes, mean 0 and deviation 1/255.
     """
 
     dim: int = _DIM
@@ -40,7 +40,7 @@ class HogConfig(WholeImageBackbone):
         columns = padded[..., :-2] + 2 * padded[..., 1:-1] + padded[..., 2:]
         across, down = rows[..., 2:] - rows[..., :-2], columns[:, 2:] - columns[:, :-2]
 
-        # In bins, from the centre of the first: each of the two nearest takes 1 less the distance.
+        # In bins, from the centre of the first: each of the two nearest gets 1 minus its distance.
         angle = jnp.arctan2(down, across) % jnp.pi * (_BINS / jnp.pi) - 0.5
         away = jnp.abs(angle[..., None] - jnp.arange(_BINS, dtype=jnp.float32))
         shares = jnp.maximum(0, 1 - jnp.minimum(away, _BINS - away))

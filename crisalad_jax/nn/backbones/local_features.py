@@ -1,7 +1,7 @@
-"""SIFT and ORB in the place of a network's patches, for heads that count words.
+"""SIFT and ORB features in place of a network's patches, for heads that count visual words.
 
-Photographs are turned into features on the host (`data.local_features`); here the bytes of these
-become vectors. Where an image has fewer features, its last patches are 0.
+The host extracts the features from photographs (`data.local_features`); here their bytes become
+vectors. If an image has fewer features, its last patches are 0.
 """
 
 import abc
@@ -19,37 +19,37 @@ from crisalad_jax.nn.backbones.handmade import HandmadeBackbone
 
 @dataclasses.dataclass(frozen=True)
 class _LocalFeatureBackbone(HandmadeBackbone):
-    """Local features of OpenCV: no parameters, and no class token."""
+    """Local features by OpenCV, without parameters or a class token."""
 
     any_size: ClassVar[bool] = True
     class_token: ClassVar[bool] = False
     exposes_levels: ClassVar[bool] = False
     local_features: ClassVar[LocalFeatures]
     count: PositiveInt = 500
-    """Number of features of an image, at most: the strongest."""
+    """Maximum number of features per image, the strongest."""
 
     @property
     def encoded_size(self) -> tuple[int, int]:
-        """Height and width of the bytes of an image's features."""
+        """Height and width of the byte array of an image's features."""
         return self.count, FEATURE_BYTES[self.local_features] // 3
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
-        """Return one row of features, whatever the size of a photograph."""
+        """Return one row of features, whatever the size of the photograph."""
         return 1, self.count
 
     @abc.abstractmethod
     def vectors(
         self, numbers: Float[Array, "image feature byte"]
     ) -> Float[Array, "image feature dim"]:
-        """Return unit vectors of the bytes of descriptors."""
+        """Convert the bytes of descriptors to unit vectors."""
 
     def apply(
         self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, None]:
-        """Return the features as patches, strongest first, and 0 where there are no more.
+        """Return the features as patches, strongest first, padded with zeros.
 
         Raises:
-            InputError: while tracing, for pixels in the place of features.
+            InputError: during tracing, if `images` are pixels instead of features.
         """
         require(
             tuple(images.shape[1:3]) == self.encoded_size,
@@ -66,8 +66,8 @@ class _LocalFeatureBackbone(HandmadeBackbone):
 class SiftConfig(_LocalFeatureBackbone):
     """SIFT (Lowe, IJCV 2004) by OpenCV, as RootSIFT (Arandjelovic and Zisserman, CVPR 2012).
 
-    The roots of a descriptor's shares of its sum, so that products of vectors are Hellinger's
-    kernel of histograms. Images are bytes, with a mean of 0 and a deviation of 1/255.
+    Each descriptor is divided by its sum, and square roots are taken, so that inner products are
+    the Hellinger kernel of histograms. Preprocessing needs bytes, mean 0 and deviation 1/255.
     """
 
     local_features: ClassVar[LocalFeatures] = "sift"
@@ -76,7 +76,7 @@ class SiftConfig(_LocalFeatureBackbone):
     def vectors(
         self, numbers: Float[Array, "image feature 128"]
     ) -> Float[Array, "image feature 128"]:
-        """Return the roots of shares."""
+        """Divide each descriptor by its sum, and return the square roots."""
         return jnp.sqrt(numbers / jnp.maximum(numbers.sum(axis=-1, keepdims=True), 1))
 
 
@@ -85,7 +85,7 @@ class OrbConfig(_LocalFeatureBackbone):
     """ORB (Rublee et al., ICCV 2011) by OpenCV.
 
     Its 256 bits become -1/16 or 1/16, so that the nearest vector is the one with the most bits in
-    common. Images are bytes, with a mean of 0 and a deviation of 1/255.
+    common. Preprocessing needs bytes, mean 0 and deviation 1/255.
     """
 
     local_features: ClassVar[LocalFeatures] = "orb"
@@ -95,6 +95,6 @@ class OrbConfig(_LocalFeatureBackbone):
     def vectors(
         self, numbers: Float[Array, "image feature 32"]
     ) -> Float[Array, "image feature 256"]:
-        """Return the bits, the highest of each byte first."""
+        """Return the bits as -1/16 or 1/16, the highest of each byte first."""
         bits = numbers.astype(jnp.int32)[..., None] >> jnp.arange(7, -1, -1) & 1
         return (2 * bits.reshape(*numbers.shape[:-1], -1) - 1) / 16

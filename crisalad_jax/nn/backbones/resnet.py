@@ -21,7 +21,7 @@ BLOCKS: dict[Layers, tuple[int, ...]] = {
     101: (3, 4, 23, 3),
     152: (3, 8, 36, 3),
 }
-"""Number of residual blocks of each stage, by the number of layers."""
+"""Number of residual blocks in each stage, by the number of layers."""
 STEM_SIDE = 7
 """Side of the first convolution's kernel."""
 
@@ -42,9 +42,9 @@ class ResNetConfig(StagedBackbone):
     layers: Layers = 50
     """Number of layers. 18 has blocks of two convolutions, the others of three."""
     stages: int = 4
-    """Number of stages that are kept, from the first."""
+    """Number of stages to use, from the first."""
     width: PositiveInt = 64
-    """Width of the first convolution, and within the blocks of the first stage; as published 64."""
+    """Width of the first convolution and inside the blocks of the first stage; published: 64."""
 
     def __post_init__(self) -> None:
         """Check the range."""
@@ -62,17 +62,17 @@ class ResNetConfig(StagedBackbone):
 
     @property
     def patch_size(self) -> int:
-        """Distance of two features in pixels."""
+        """Distance between neighbouring features in pixels."""
         return 2 ** (self.stages + 1)
 
     @property
     def extras(self) -> str:
-        """The number of layers, and the width where it is not the published one."""
+        """The number of layers, and the width if it is not the published one."""
         width = "" if self.width == 64 else f" of width {self.width}"
         return f", ResNet-{self.layers}{width}"
 
     def widths(self, stage: int) -> tuple[int, ...]:
-        """Return the widths of a block's convolutions in the stage of this number, from 0."""
+        """Return the widths of a block's convolutions in stage `stage`, counted from 0."""
         width = self.width * 2**stage
         return (width, width) if self.layers == 18 else (width, width, 4 * width)
 
@@ -82,7 +82,7 @@ class ResNetConfig(StagedBackbone):
         return -(-height // self.patch_size), -(-width // self.patch_size)
 
     def init(self, key: PRNGKeyArray) -> Stages:
-        """Draw parameters as torchvision does before training."""
+        """Draw parameters as torchvision initialises them."""
         stem_key, *keys = random_init.split(key, 1 + self.stages)
         return Stages(
             init_conv_norm(stem_key, STEM_SIDE, 3, self.width),
@@ -90,7 +90,7 @@ class ResNetConfig(StagedBackbone):
         )
 
     def adapt_checkpoint(self, config: Any, params: Stages, fresh: Any) -> tuple[Any, Stages]:
-        """Take the first stages of a backbone with more, as torchvision's files have four."""
+        """Take the first stages of a backbone that has more; torchvision's files have four."""
         stages = min(config.stages, self.stages)
         blocks: Any = params.blocks[:stages]
         changed = dataclasses.replace(config, stages=stages)
@@ -110,12 +110,12 @@ class ResNetConfig(StagedBackbone):
             d_in = widths[-1]
 
     def run_stem(self, params: ConvNorm, images: Map, valid: Valid) -> tuple[Map, ConvNorm]:
-        """Convolve by 7 x 7, and take the maxima of 3 x 3: both halve the grid."""
+        """Apply the 7 x 7 convolution and 3 x 3 max pooling, each of which halves the grid."""
         x, params = conv_norm(params, images, valid, stride=2)
         return max_pool(jax.nn.relu(x), 3, padding=1), params
 
     def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
-        """Run the blocks; the first halves the grid, but for the first stage's."""
+        """Run the blocks; the first one halves the grid, except in the first stage."""
         layers = []
         for i, block in enumerate(params.layers):
             x, block = residual(block, x, valid, stride=2 if number and not i else 1)
@@ -124,10 +124,10 @@ class ResNetConfig(StagedBackbone):
 
 
 def residual(params: Residual, x: Map, valid: Valid, *, stride: int) -> tuple[Map, Residual]:
-    """Add the convolutions' output to the input; the first of 3 x 3 has the stride.
+    """Add the output of the convolutions to the input; the first 3 x 3 one has the stride.
 
     Returns:
-        (y, updated): the output, and the block as `conv_norm` returns its layers.
+        (y, updated): the output, and the block with its layers as `conv_norm` returns them.
     """
     y, convs, shortcut = x, [], params.shortcut
     strided = next(i for i, each in enumerate(params.convs) if each.conv.weight.shape[0] == 3)

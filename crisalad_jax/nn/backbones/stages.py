@@ -15,8 +15,8 @@ from crisalad_jax.utils.devices import parts_for_caches
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 _PIXELS = 2**18
-"""Pixels of the images that a CPU's core computes at once: of ResNet-50 the largest activation is
-16 MB then. One image of 480 x 640 at a time takes 0.8 of the time of eight."""
+"""Image pixels that a CPU core computes at once: ResNet-50's largest activation is then 16 MB. One
+image of 480 x 640 at a time takes 0.8 times as long as eight at a time."""
 
 
 @pytree_dataclass
@@ -28,7 +28,7 @@ class Stage:
 
 @pytree_dataclass
 class Stages:
-    """A convolutional backbone: what comes before its stages, if anything, and the stages."""
+    """A convolutional backbone: the stem before its stages, if any, and the stages."""
 
     stem: Any
     blocks: tuple[Stage, ...]
@@ -36,7 +36,7 @@ class Stages:
 
 @dataclasses.dataclass(frozen=True)
 class StagedBackbone(Backbone):
-    """A backbone whose blocks are stages, and whose features are the last stage's positions.
+    """A backbone whose blocks are stages; each position of the last stage is a feature.
 
     Its width and its number of stages follow from its other settings.
     """
@@ -44,27 +44,27 @@ class StagedBackbone(Backbone):
     any_size: ClassVar[bool] = True
     class_token: ClassVar[bool] = False
     exposes_levels: ClassVar[bool] = False
-    # Annotated anew so that they are no fields: subclasses compute them.
+    # Annotated again so that they are not fields: subclasses compute them.
     dim: ClassVar[int]  # pyright: ignore[reportIncompatibleVariableOverride]
     depth: ClassVar[int]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def run_stem(self, params: Any, images: Map, valid: Valid) -> tuple[Map, Any]:
-        """Return what the first stage takes, and the stem with updated statistics.
+        """Return the input of the first stage, and the stem with updated statistics.
 
-        By default nothing comes before the first stage. `valid` is that of `apply`.
+        By default there is no stem. `valid` is as in `apply`.
         """
         return images, params
 
     @abc.abstractmethod
     def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
-        """Return the output of the stage of this number, from 0, and the stage as `run_stem`."""
+        """Return the output of stage `number`, from 0, and the stage with updated statistics."""
 
     def apply(
         self, params: Stages, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, Stages]:
-        """Return the last stage's vectors, in row order; there is no class token, and no last norm.
+        """Return the last stage's vectors in row order, without a class token or a last norm.
 
-        With remat "full" the backward pass computes every stage again from its input.
+        With remat "full" the backward pass recomputes every stage from its input.
         """
         count, height, width, _ = images.shape
         parts = parts_for_caches(count, _PIXELS // (height * width)) if valid is None else 1
@@ -94,12 +94,12 @@ class StagedBackbone(Backbone):
 def _compute_in_parts(
     run: Callable[[Stages, Map], Array], parts: int, params: Stages, images: Map
 ) -> Float[Array, "image patch dim"]:
-    """Call `run` on some images at a time, where no gradient is asked for.
+    """Call `run` on some images at a time if no gradient is requested.
 
-    A gradient is of the whole batch: XLA has no fast convolutions for the backward pass in a loop
-    (16 images through a ResNet-18 of width 32: 13.8 s in parts, 0.8 s whole).
+    Gradients use the whole batch: XLA has no fast convolutions for the backward pass in a loop (16
+    images through a ResNet-18 of width 32: 13.8 s in parts, 0.8 s as one batch).
     """
-    # A part takes some images of every device's: a batch's first axis is spread over them.
+    # Each part takes images from every device: the first axis of a batch is sharded over them.
     split = images.reshape(-1, parts, *images.shape[1:]).swapaxes(0, 1)
     found = jax.lax.map(functools.partial(run, params), split)
     return found.swapaxes(0, 1).reshape(len(images), *found.shape[2:])

@@ -1,7 +1,7 @@
 """TeTRA's vision transformer, whose linear layers have weights of -1, 0 and 1.
 
 Grainge et al., TeTRA-VPR, 2025; the ternary layer is BitNet b1.58's (Ma et al. 2024). Constants
-that the papers leave out are those of OliverGrainge/TeTRA-VPR.
+missing from the papers are from OliverGrainge/TeTRA-VPR.
 """
 
 import dataclasses
@@ -38,23 +38,23 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 STEPS = 127
-"""Largest number of steps of an activation: those of 8 bits."""
+"""Largest magnitude of an activation quantised to 8 bits, in steps."""
 _SMALLEST = 1e-5
-"""Least size of what activations and weights are divided by."""
+"""Lower bound of the scales that activations and weights are divided by."""
 
 
 @pytree_dataclass
 class TetraBlock:
-    """A pre-norm block; a ternary one has two layer norms more than ViT's, the last one more."""
+    """A pre-norm block like ViT's, plus two layer norms in a ternary block and one in the last."""
 
     norm1: LayerNorm
     attn: Attention
     norm2: LayerNorm
-    """Of the heads' output, before the projection."""
+    """Norm of the heads' output before projection."""
     norm3: LayerNorm
     fc1: Linear
     norm4: LayerNorm | None
-    """Of the hidden layer; None in the last block."""
+    """Hidden-layer norm; None in the last block."""
     fc2: Linear
 
 
@@ -63,11 +63,11 @@ class TetraVit:
     """The backbone. In `blocks`, the ternary ones, every leaf has a leading axis."""
 
     pos_embed: Float[Array, "token dim"]
-    """Of the class token, and of patches in row order."""
+    """Class token's, then the patches' in row order."""
     cls_token: Float[Array, " dim"]
     patch_norm: LayerNorm
     patch_embed: Linear
-    """Of a patch's pixels in (row, column, channel) order."""
+    """Layer over pixels in (row, column, channel) order."""
     token_norm: LayerNorm
     blocks: TetraBlock
     last: TetraBlock
@@ -77,8 +77,8 @@ class TetraVit:
 class TetraVitConfig(Backbone):
     """TeTRA's ternary vision transformer with patches of 14 x 14 (Grainge et al. 2025).
 
-    All blocks but the last have ternary weights, in training too: parameters are the floats that
-    are rounded. Images have one size, of `position_grid` patches a side.
+    All blocks but the last have ternary weights, in training too: the parameters are the floats
+    before rounding. Images have a fixed size of `position_grid` patches per side.
     """
 
     exposes_levels: ClassVar[bool] = False
@@ -95,7 +95,7 @@ class TetraVitConfig(Backbone):
         require_field(self, "depth", self.depth > 1, "at least 2, of which the last is not ternary")
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
-        """Return the rows and columns of patches, those of the position embeddings."""
+        """Return the rows and columns of patches, as in the position embeddings."""
         side = self.position_grid * self.patch_size
         height, width = image_size
         require(
@@ -137,9 +137,9 @@ class TetraVitConfig(Backbone):
     def apply(
         self, params: TetraVit, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, TetraVit]:
-        """Return the last block's tokens; there is no last norm.
+        """Return the tokens of the last block, without a last norm.
 
-        With remat "full" the backward pass computes every block again from its input.
+        With remat "full" the backward pass recomputes every block from its input.
         """
 
         def body(x: TokenBatch, layer: TetraBlock) -> tuple[TokenBatch, None]:
@@ -154,7 +154,7 @@ class TetraVitConfig(Backbone):
 
 
 def embed(params: TetraVit, images: Pixels, config: TetraVitConfig) -> TokenBatch:
-    """Return the class token and the embedded patches, normalised before and after."""
+    """Return the class token and the patches, normalised before and after embedding."""
     count, side, size = images.shape[0], config.position_grid, config.patch_size
     pixels = images.reshape(count, side, size, side, size, 3).swapaxes(2, 3)
     patches = layer_norm(params.patch_norm, pixels.reshape(count, side**2, 3 * size**2))
@@ -165,7 +165,7 @@ def embed(params: TetraVit, images: Pixels, config: TetraVitConfig) -> TokenBatc
 
 
 def block(params: TetraBlock, x: TokenBatch, heads: int) -> TokenBatch:
-    """Add attention and the feed-forward network, ternary where the hidden layer has a norm."""
+    """Add attention and the feed-forward network, ternary if the hidden layer has a norm."""
     layer = linear if params.norm4 is None else ternary_linear
     qkv = split_heads(layer(params.attn.qkv, layer_norm(params.norm1, x)), 3 * heads)
     mixed = dot_product_attention(*jnp.split(qkv, 3, axis=-2)).reshape(x.shape)
@@ -176,14 +176,14 @@ def block(params: TetraBlock, x: TokenBatch, heads: int) -> TokenBatch:
 
 
 def ternary_linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
-    """Map the last axis by weights of -1, 0 and 1 times their mean size, in steps of 8 bits.
+    """Map the last axis, in 8-bit steps, by weights of -1, 0 and 1 times their mean magnitude.
 
-    Rounding is half to even. Sums of steps are whole numbers below 2^24, which float32 has exactly.
-    Gradients pass through the roundings as if there were none.
+    Rounding is half to even. Sums of steps are integers below 2^24, which float32 holds exactly.
+    Gradients pass straight through the rounding.
 
     Args:
         params: the layer, whose weight is rounded here.
-        x: activations; each token's steps are a 127th of its largest size.
+        x: activations, which are rounded to steps of 1/127 of each token's largest magnitude.
     """
     wide = at_least_float32(x)
     fine = STEPS / jnp.maximum(jnp.abs(wide).max(axis=-1, keepdims=True), _SMALLEST)
@@ -197,5 +197,5 @@ def ternary_linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Arra
 
 
 def _straight_through(x: Array, rounded: Array) -> Array:
-    """Return the rounded numbers, with the gradient of `x`."""
+    """Return the rounded values, with the gradient of `x`."""
     return jax.lax.stop_gradient(rounded) + (x - jax.lax.stop_gradient(x))

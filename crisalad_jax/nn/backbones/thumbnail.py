@@ -1,4 +1,4 @@
-"""Small grey images, normalised patch by patch: what SeqSLAM compares (Milford and Wyeth 2012)."""
+"""Small grey images, normalised patch by patch, as in SeqSLAM (Milford and Wyeth 2012)."""
 
 from typing import ClassVar
 
@@ -12,18 +12,18 @@ _SIZE = 32, 64
 _PATCH = 8
 _DIM = _SIZE[0] * _SIZE[1]
 _GREY = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue, of BT.601."""
+"""Weights of red, green and blue, from BT.601."""
 _LEAST = 0.5
-"""Least deviation, half a grey level: a uniform patch's rounding is not to be amplified."""
+"""Least deviation, half a grey level, so that rounding in a uniform patch isn't amplified."""
 
 
 @BACKBONES.register("thumbnail")
 class ThumbnailConfig(WholeImageBackbone):
     """SeqSLAM's images of 32 x 64 grey pixels (Milford and Wyeth, ICRA 2012).
 
-    Each patch of 8 x 8 is less its mean and divided by its deviation. A picture of uniform patches
-    gets equal values. There are no parameters: the class token is the descriptor. Images are bytes,
-    with a mean of 0 and a deviation of 1/255.
+    Each patch of 8 x 8 is normalised by its mean and deviation. An image of uniform patches gets
+    equal values. There are no parameters: the class token is the descriptor. Preprocessing needs
+    bytes, mean 0 and deviation 1/255.
     """
 
     dim: int = _DIM

@@ -1,6 +1,6 @@
-"""TransVPR's own backbone: convolutions, and a transformer over patches of all their maps.
+"""TransVPR's own backbone: convolutions, and a transformer over patches of all their feature maps.
 
-Wang et al., CVPR 2022, section 3.1. Constants that the paper leaves out are those of
+Wang et al., CVPR 2022, section 3.1. Constants missing from the paper are from
 RuotongWANG/TransVPR-model-implementation.
 """
 
@@ -46,12 +46,12 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 WIDTHS = (64, 128, 256, 512)
-"""Widths of the convolutions; each is followed by a maximum that halves the grid."""
+"""Widths of the convolutions; each is followed by max pooling that halves the grid."""
 
 
 @pytree_dataclass
 class TransVprBlock:
-    """Attention and a feed-forward network. `norm1` takes the place of what it normalises."""
+    """Attention and a feed-forward network. The output of `norm1` replaces its input."""
 
     pre_norm: LayerNorm
     self_attn: Attention
@@ -66,11 +66,11 @@ class TransVprNet:
 
     convs: tuple[ConvNorm, ...]
     tokenizers: tuple[Conv, ...]
-    """Convolutions without overlap, of every map to one grid."""
+    """Non-overlapping convolutions of each map to one grid."""
     cls_token: Float[Array, " dim"]
     blocks: TransVprBlock
     norm: LayerNorm
-    """Layer norm of every block's output that is asked for."""
+    """Layer norm of every requested block output."""
 
 
 @BACKBONES.register("transvpr-net", tiny={"dim": 64, "depth": 4})
@@ -91,7 +91,7 @@ class TransVprNetConfig(Backbone):
         require_field(self, "dim", fits, words)
 
     def init(self, key: PRNGKeyArray) -> TransVprNet:
-        """Draw parameters: convolutions as He et al., linears normal of deviation 0.02."""
+        """Draw parameters: convolutions as He et al. do, linears normal with deviation 0.02."""
         conv_key, token_key, block_key = random_init.split(key, 3)
         conv_keys, token_keys = (random_init.split(x, len(WIDTHS)) for x in (conv_key, token_key))
         part = self.dim // len(WIDTHS)
@@ -123,12 +123,12 @@ class TransVprNetConfig(Backbone):
     def apply(
         self, params: TransVprNet, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, TransVprNet]:
-        """Return the patches of the requested levels side by side, and the last one's class token.
+        """Return the concatenated patches of the requested levels, and the last one's class token.
 
-        With remat "full" the backward pass computes every block again from its input.
+        With remat "full" the backward pass recomputes every block from its input.
 
         Raises:
-            InputError: while tracing, for levels out of order.
+            InputError: during tracing, if the levels are out of order.
         """
         levels = request.levels_of(self.depth)
 
@@ -149,7 +149,7 @@ class TransVprNetConfig(Backbone):
 
 
 def _side(number: int) -> int:
-    """Return the side of a patch on the map of this number, from 0."""
+    """Return the side of a patch on map `number`, counted from 0."""
     return TransVprNetConfig.patch_size // 2 ** (number + 1)
 
 
@@ -157,7 +157,7 @@ def embed(params: TransVprNet, images: Pixels, valid: Valid) -> tuple[TokenBatch
     """Return the class token, and for every patch a vector with a part from each map.
 
     Returns:
-        (tokens, updated): the second has updated statistics where `valid` is given.
+        (tokens, updated): the second has updated statistics if `valid` is given.
     """
     x, parts, convs = images, [], []
     for number, layer in enumerate(params.convs):

@@ -1,4 +1,4 @@
-"""VGG-16 (Simonyan and Zisserman, ICLR 2015) up to its last convolution, as NetVLAD has it."""
+"""VGG-16 (Simonyan and Zisserman, ICLR 2015) up to its last convolution, as in NetVLAD."""
 
 import itertools
 from typing import ClassVar
@@ -18,10 +18,10 @@ WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512
 
 @BACKBONES.register("vgg")
 class VggConfig(StagedBackbone):
-    """VGG-16 without its last ReLU and maximum (Simonyan and Zisserman, ICLR 2015)."""
+    """VGG-16 without its last ReLU and max pooling (Simonyan and Zisserman, ICLR 2015)."""
 
     patch_size: ClassVar[int] = 16
-    """Distance of two features in pixels."""
+    """Distance between neighbouring features in pixels."""
     depth: ClassVar[int] = len(WIDTHS)
     """Number of stages."""
     dim: ClassVar[int] = WIDTHS[-1][-1]
@@ -33,14 +33,14 @@ class VggConfig(StagedBackbone):
         return height // self.patch_size, width // self.patch_size
 
     def init(self, key: PRNGKeyArray) -> Stages:
-        """Draw parameters as torchvision does before training."""
+        """Draw parameters as torchvision initialises them."""
         widths = list(itertools.chain.from_iterable(WIDTHS))
         pairs = zip(random_init.split(key, len(widths)), (3, *widths), widths, strict=False)
         layers = iter([init_he_conv(each, 3, a, b, bias=True) for each, a, b in pairs])
         return Stages(None, tuple(Stage(tuple(itertools.islice(layers, len(w)))) for w in WIDTHS))
 
     def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
-        """Run the convolutions, after maxima that halve the grid; the last one has no ReLU."""
+        """Pool (except in the first stage), and run the convolutions; the last has no ReLU."""
         x = max_pool(x, 2) if number else x
         for i, layer in enumerate(params.layers):
             x = conv(layer, x)

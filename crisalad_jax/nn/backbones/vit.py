@@ -1,7 +1,7 @@
 """DINOv2's vision transformer ViT/14 (Oquab et al. 2023; registers: Darcet et al. 2024).
 
-Written from the papers and the behaviour of facebookresearch/dinov2, whose golden outputs it meets.
-The blocks are DINOv3's too, whose other parts are in `dinov3.py`.
+Written from the papers and the behaviour of facebookresearch/dinov2, whose golden outputs it
+reproduces. DINOv3 has the same blocks; its other parts are in `dinov3.py`.
 """
 
 import dataclasses
@@ -70,7 +70,7 @@ from crisalad_jax.utils.pytree import expect_like, pytree_dataclass
 
 NORM_EPSILON = 1e-6
 _PRODUCTS = ("qkv", "attended", "hidden", "down", "mixed")
-"""Results of a block's large products and the tokens between its halves, by their names."""
+"""Names of the results of a block's large products, and of the tokens between its halves."""
 _POLICIES = {
     "dots": jax.checkpoint_policies.save_only_these_names(*_PRODUCTS),
     "full": jax.checkpoint_policies.nothing_saveable,
@@ -88,7 +88,7 @@ class Mlp:
 
 @pytree_dataclass
 class SwiGlu:
-    """Feed-forward network of ViT-g: w12 computes gate and value side by side, w3 projects."""
+    """Feed-forward network of ViT-g: w12 computes gate and value together, w3 projects."""
 
     w12: Linear
     w3: Linear
@@ -105,22 +105,22 @@ class Block:
     mlp: Mlp | SwiGlu
     ls2: Float[Array, "*stack dim"]
     adapter: Any
-    """Parameters of `VisionTransformer.adapter`; None where it has none."""
+    """Parameters of `VisionTransformer.adapter`; None if it has none."""
 
 
 @pytree_dataclass
 class ViT:
     """The backbone. In `blocks` every leaf has a leading depth axis.
 
-    That of adapters is shorter where only the last blocks have one.
+    The axis of adapters is shorter if only the last blocks have one.
 
     A tuple of such stacks runs in sequence. Training uses it to exclude frozen blocks from the
-    gradient where only the last ones train. Rotary positions have no parameters: `pos_embed_cls`
-    and `pos_embed` are None. Without registers `register_tokens` is None.
+    gradient if only the last ones train. Rotary positions have no parameters: `pos_embed_cls` and
+    `pos_embed` are None. Without registers `register_tokens` is None.
     """
 
     patch_embed: Linear
-    """Linear layer whose weight's rows are a patch's pixels in (row, column, channel) order."""
+    """Linear layer; its weight's rows are a patch's pixels in (row, column, channel) order."""
     cls_token: Float[Array, " dim"]
     register_tokens: Float[Array, "register dim"] | None
     pos_embed_cls: Float[Array, " dim"] | None
@@ -131,14 +131,14 @@ class ViT:
 
 @dataclasses.dataclass(frozen=True)
 class VisionTransformer(Backbone):
-    """What DINOv2's and DINOv3's transformers share: all but positions, and how a block attends."""
+    """Base of DINOv2's and DINOv3's transformers, which differ in positions and attention."""
 
     supports_prompt_tokens: ClassVar[bool] = True
     exposes_cls_attention: ClassVar[bool] = True
     norm_epsilon: ClassVar[float] = NORM_EPSILON
     """Added to the variance in every layer norm."""
     token_deviation: ClassVar[float] = 1e-6
-    """Standard deviation of an untrained class token and registers."""
+    """Standard deviation of the initial class token and registers."""
     heads: PositiveInt = 12
     mlp_ratio: PositiveFloat = 4.0
     ffn: Literal["mlp", "swiglu"] = "mlp"
@@ -161,7 +161,7 @@ class VisionTransformer(Backbone):
 
     @property
     def hidden(self) -> int:
-        """Hidden width of the feed-forward network; SwiGLU's 2/3 round up to a multiple of 8."""
+        """Hidden width of the feed-forward network; SwiGLU's 2/3 rounds up to a multiple of 8."""
         hidden = int(self.dim * self.mlp_ratio)
         return (int(hidden * 2 / 3) + 7) // 8 * 8 if self.ffn == "swiglu" else hidden
 
@@ -180,7 +180,7 @@ class VisionTransformer(Backbone):
 
     @property
     def extras(self) -> str:
-        """Registers and the adapter."""
+        """The number of registers, and the adapter."""
         return f", {self.registers} registers, adapter {self.adapter.part_name}"
 
     def init_positions(
@@ -192,19 +192,19 @@ class VisionTransformer(Backbone):
     def add_positions(
         self, params: ViT, patches: Patches, grid: Grid
     ) -> tuple[Float[Array, " dim"], Patches]:
-        """Return the class token and the embedded patches, with their positions added if any."""
+        """Return the class token and the embedded patches, with any positions added."""
         return params.cls_token, patches
 
     def rotation(self, grid: Grid) -> Rotation | None:
-        """Return the patches' angles, by which every block rotates queries and keys; or None."""
+        """Return the angles by which every block rotates the patches' queries and keys, or None."""
         return None
 
     def attention_of(self, layer: Block) -> Attention:
-        """Return the parameters that a block attends by."""
+        """Return the parameters of a block's attention."""
         return layer.attn
 
     def init(self, key: PRNGKeyArray) -> ViT:
-        """Draw parameters as published before training: linears of deviation 0.02, biases 0."""
+        """Draw parameters as published: linear layers with deviation 0.02, biases of 0."""
         patch, first, register, position, block = random_init.split(key, 5)
         deviation, normal = self.token_deviation, random_init.normal
         pos_embed_cls, pos_embed = self.init_positions(position)
@@ -260,28 +260,28 @@ class VisionTransformer(Backbone):
         remat: str = "dots",
         valid: Valid = None,
     ) -> tuple[Features, ViT]:
-        """Compute features of a batch of normalised images whose sides are multiples of a patch's.
+        """Compute features of normalised images whose sides are multiples of the patch size.
 
         Levels are concatenated, to a width of levels times dim. The class token is the last
-        level's. With several levels the stack of blocks is cut at each, which for inference needs
-        the memory of its parameters once more. Blocks after the last level are not run.
+        level's. With several levels the stack of blocks is cut at each, which in inference needs
+        memory for a second copy of its parameters. Blocks after the last level are not run.
 
         Args:
-            params: the backbone.
+            params: parameters of the backbone.
             images: normalised pixels.
             request: the features to return.
-            remat: `ModelConfig.remat`.
-            valid: images that the statistics of adapters' batch norms are taken of, if all blocks
-                are run; None takes the stored ones, which stay.
+            remat: see `ModelConfig.remat`.
+            valid: mask of the images whose statistics the adapters' batch norms use, if all blocks
+                are run; None uses the stored ones, without updating them.
 
         Returns:
-            (features, updated): the second holds the running statistics, and None for all other
-            leaves where `valid` is given.
+            (features, updated): if `valid` is given, the second holds the running statistics, and
+            None for all other leaves.
 
         Raises:
-            InputError: while tracing, for levels that are not in order or more than there are
-                blocks, or for more than one of levels or a facet, inserted tokens, the class
-                token's attention, and adapters on a side path.
+            InputError: during tracing, if levels are out of order or exceed the number of blocks,
+                or for more than one of these: levels or a facet, inserted tokens, the class token's
+                attention, adapters on a side path.
         """
         levels = _checked_levels(request, self)
         stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
@@ -315,7 +315,7 @@ class VisionTransformer(Backbone):
                     request.inserted, (tokens.shape[0], *request.inserted.shape)
                 )
                 tokens = jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
-            else:  # the block's own attention does not keep its weights: a row is computed again
+            else:  # the block's own attention does not store its weights: recompute a row
                 layer = _block_at(stacks, end)
                 shares = self._attention_by(first_token_attention, layer, tokens, grid)
                 attended = shares.sum(axis=-2)[:, 1 + self.registers :]
@@ -334,14 +334,14 @@ class VisionTransformer(Backbone):
     ) -> Float[Array, "image head token token"]:
         """Compute the attention of a block; see `nn.model.attention_maps`."""
         stack, grid = _one_stack(params), self.grid((images.shape[1], images.shape[2]))
-        _checked_levels(FeatureSpec(class_attention=True), self)  # the same adapters are refused
+        _checked_levels(FeatureSpec(class_attention=True), self)  # refuses the same adapters
         tokens, _ = run_blocks([stack], embed(params, images, self), grid, self, count=block)
         return self._attention_by(attention_weights, _block_at([stack], block), tokens, grid)
 
     def _attention_by(
         self, weigh: Callable[..., Array], layer: Block, tokens: TokenBatch, grid: Grid
     ) -> Array:
-        """Compute weights of a block's attention: of `first_token_attention`, or of all tokens."""
+        """Compute a block's attention weights by `weigh`: for the first token, or for all."""
         with jax.named_scope("blocks"):
             normed = layer_norm(layer.norm1, tokens, epsilon=self.norm_epsilon)
             attn, rotation = self.attention_of(layer), self.rotation(grid)
@@ -350,7 +350,7 @@ class VisionTransformer(Backbone):
 
     @property
     def trains(self) -> tuple[str, ...]:
-        """Return the adapters' name."""
+        """Return the name pattern of the adapters' parameters."""
         if isinstance(self.adapter, NoAdapter):
             return ()
         return ("blocks.*.adapter",) if self.adapter.last is None else ("blocks*.adapter",)
@@ -361,7 +361,7 @@ class VisionTransformer(Backbone):
         return dataclasses.replace(params, blocks=tuple(_cut(stack, *pair) for pair in ends))
 
     def adapt_checkpoint(self, config: Any, params: ViT, fresh: ViT) -> tuple[Any, ViT]:
-        """Take the fresh adapters where the other's are of another kind or size."""
+        """Take the fresh adapters if the other backbone's differ in kind or size."""
         if config.adapter == self.adapter:
             return config, params
         blocks = dataclasses.replace(_one_stack(params), adapter=_one_stack(fresh).adapter)
@@ -419,10 +419,10 @@ class ViTConfig(VisionTransformer):
     position_grid: PositiveInt = 37
     """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
     position_resize: Literal["dinov2", "plain"] = "dinov2"
-    """Resizing of that grid to an image's: as DINOv2's models do, which antialias where there are
+    """How that grid is resized to an image's: as DINOv2's models do, antialiased if there are
     registers; or plain, never antialiased."""
     position_init: Literal["random", "sincos"] = non_semantic_field("random")
-    """Initialisation of the position embeddings where no weights are loaded."""
+    """Initialisation of the position embeddings if no weights are loaded."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -433,7 +433,7 @@ class ViTConfig(VisionTransformer):
     def init_positions(
         self, key: PRNGKeyArray
     ) -> tuple[Float[Array, " dim"], Float[Array, "grid grid dim"]]:
-        """Draw the patches' positions, or make sine-cosine codes; the class token's are 0."""
+        """Draw the positions of patches, or compute sine-cosine codes; the class token's is 0."""
         side = self.position_grid
         if self.position_init == "sincos":
             positions = jax.device_put(_sincos_positions(side, self.dim).astype(np.float32))
@@ -444,7 +444,7 @@ class ViTConfig(VisionTransformer):
     def add_positions(
         self, params: ViT, patches: Patches, grid: Grid
     ) -> tuple[Float[Array, " dim"], Patches]:
-        """Add the class token's position to it, and the resized grid of positions to patches."""
+        """Add its position to the class token, and the resized grid of positions to the patches."""
         assert params.pos_embed_cls is not None
         assert params.pos_embed is not None
         positions = interpolate_positions(params.pos_embed, grid, self)
@@ -468,10 +468,10 @@ def _sincos_positions(side: int, dim: int) -> np.ndarray:
 
 
 def _statistics(params: ViT, measured: Sequence[Block]) -> ViT:
-    """Return the running statistics of blocks, in stacks as those of `params`."""
+    """Return the running statistics of blocks, in stacks like those of `params`."""
     blocks: Any = _joined(measured)
     if isinstance(params.blocks, tuple):
-        # Statistics are adapters' alone.
+        # Only adapters have statistics.
         rows = (len(stack.ls1) - _unadapted(stack) for stack in params.blocks)
         cuts = 0, *itertools.accumulate(rows)
         blocks = tuple(_rows(blocks, *pair) for pair in itertools.pairwise(cuts))
@@ -499,7 +499,7 @@ def _rows(tree: Any, begin: int, end: int) -> Any:
 
 
 def _cut(stack: Block, begin: int, end: int) -> Block:
-    """Return the blocks from number `begin` to before `end`, with the adapters that they have."""
+    """Return the blocks with numbers from `begin` to `end` - 1, with their adapters."""
     first = _unadapted(stack)
     if first == 0:
         return _rows(stack, begin, end)
@@ -509,13 +509,13 @@ def _cut(stack: Block, begin: int, end: int) -> Block:
 
 
 def _unadapted(stack: Block) -> int:
-    """Return how many of a stack's first blocks have no adapter, of one that others have."""
+    """Return how many leading blocks of a stack lack the adapter that later ones have."""
     leaves = jax.tree.leaves(stack.adapter)
     return len(stack.ls1) - len(leaves[0]) if leaves else 0
 
 
 def _adapter_of(layer: Block, config: VisionTransformer) -> Adapter:
-    """Return a block's adapter: none where only later blocks have one."""
+    """Return a block's adapter, which is `NoAdapter` if only later blocks have one."""
     has = layer.adapter is not None or config.adapter.last is None
     return config.adapter if has else NoAdapter()
 
@@ -525,7 +525,7 @@ def _joined(stacks: Sequence[Block]) -> Block:
 
 
 def _between(stacks: Sequence[Block], begin: int, end: int) -> Sequence[Block]:
-    """Return the blocks from number `begin` to before `end`, from 0."""
+    """Return the blocks with numbers from `begin` to `end` - 1, counted from 0."""
     parts = []
     for stack in stacks:
         size = len(stack.ls1)
@@ -544,7 +544,7 @@ def _block_at(stacks: Sequence[Block], number: int) -> Block:
 def _facet(layer: Block, tokens: TokenBatch, config: VisionTransformer, name: str) -> TokenBatch:
     """Compute queries, keys or values of a block's attention (AnyLoc: Keetha et al. 2023).
 
-    Heads are side by side, and not rotated.
+    Heads are concatenated, and not rotated.
     """
     number = ("query", "key", "value").index(name)
     normed = layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon)
@@ -554,7 +554,7 @@ def _facet(layer: Block, tokens: TokenBatch, config: VisionTransformer, name: st
 def embed(
     params: ViT, images: Float[Array, "*batch height width 3"], config: VisionTransformer
 ) -> Float[Array, "*batch token dim"]:
-    """Embed images: class token, registers and patches, with their positions added if any."""
+    """Embed images: class token, registers and patches, with any positions added."""
     *batch, height, width, _ = images.shape
     grid, size = config.grid((height, width)), config.patch_size
     pixels = images.reshape(*batch, grid[0], size, grid[1], size, 3).swapaxes(-4, -3)
@@ -578,23 +578,22 @@ def run_blocks(
     count: int | None = None,
     path: int = 0,
 ) -> tuple[TokenBatch, list[Block]]:
-    """Run stacks of blocks in turn, each with one compiled body.
+    """Run stacks of blocks in sequence, each with one compiled body.
 
-    An adapter may have a path of its own, from which the tokens then come (`Adapter.side_path`), or
-    put prompts in front, which are dropped in the end.
-    Between the first and the last block the tokens are padded
-    as `attention` needs them on this platform.
+    An adapter may have a side path, whose tokens are then returned (`Adapter.side_path`), or
+    prepend prompts, which are dropped at the end. Between the first and the last block the tokens
+    are padded as `attention` needs on this platform.
 
     Args:
         stacks: blocks whose leaves have a leading depth axis.
         tokens: of a batch of images.
         grid: rows and columns of patches.
-        config: the backbone's.
-        remat: `ModelConfig.remat`.
+        config: configuration of the backbone.
+        remat: see `ModelConfig.remat`.
         valid: see `VisionTransformer.apply`.
-        count: number of first blocks of a single stack that are run; None is all. They are indexed,
+        count: number of leading blocks of a single stack to run; None runs all. They are indexed,
             because a slice of the stack would copy its weights.
-        path: number of the adapters' side path that is run.
+        path: index of the adapters' side path to run.
 
     Returns:
         (tokens, statistics): the second has a stack of running statistics for each of `stacks`.
@@ -659,7 +658,7 @@ def run_blocks(
 
 
 def _with_prompts(tokens: TokenBatch, layer: Block, config: VisionTransformer) -> TokenBatch:
-    """Put a block's prompts in the place of the first tokens."""
+    """Replace the first tokens with a block's prompts."""
     prompts = config.adapter.prompts(layer.adapter)
     assert prompts is not None
     first = jnp.broadcast_to(prompts.astype(tokens.dtype), (tokens.shape[0], *prompts.shape))
@@ -684,11 +683,11 @@ def block(
     Args:
         params: the block.
         tokens: of a batch of images.
-        info: of these tokens.
-        config: the backbone's.
+        info: describes these tokens.
+        config: configuration of the backbone.
 
     Returns:
-        (tokens, statistics): the second has the running statistics, and None for all else.
+        (tokens, statistics): the second has the running statistics, and None for other leaves.
     """
     adapter = _adapter_of(params, config)
     normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
@@ -716,7 +715,7 @@ def block(
 
 
 def _update_of(layer: Block, config: VisionTransformer) -> LinearUpdate:
-    """Return what a block's adapter adds to its linear layers."""
+    """Return the function that computes an adapter's updates of a block's linear layers."""
     sizes, where = config.block_shape.linears, f"adapter {config.adapter.part_name}"
 
     def update(name: str, x: Array) -> Array | None:
@@ -731,7 +730,7 @@ def _update_of(layer: Block, config: VisionTransformer) -> LinearUpdate:
 
 
 def _check_merged(layer: Block, merged: Block, config: VisionTransformer) -> None:
-    """Check that a block's merged linear layers give what they gave with their updates."""
+    """Check that a block's merged linear layers match the original ones with their updates."""
     update = _update_of(layer, config)
     for name, (width, _) in config.block_shape.linears.items():
         part = "attn" if hasattr(layer.attn, name) else "mlp"
@@ -746,7 +745,7 @@ def _check_merged(layer: Block, merged: Block, config: VisionTransformer) -> Non
 
 
 def _added(x: TokenBatch, update: TokenBatch | None, config: VisionTransformer) -> TokenBatch:
-    """Add what an adapter's hook returned."""
+    """Add the update that an adapter's hook returned, if any."""
     if update is None:
         return x
     expect_like(f"adapter {config.adapter.part_name}", update, x)
@@ -761,9 +760,9 @@ def _residual(tokens: TokenBatch, gain: float | Array, update: TokenBatch) -> To
 def feed_forward(
     params: Mlp | SwiGlu, x: Float[Array, "*batch dim"], update: LinearUpdate = no_update
 ) -> Float[Array, "*batch dim"]:
-    """Apply the feed-forward network: GELU, or SwiGLU (Shazeer 2020) if `params` are its.
+    """Apply the feed-forward network: GELU for `Mlp`, SwiGLU (Shazeer 2020) for `SwiGlu`.
 
-    All tokens are rows of one matrix, so that XLA can write GELU over the product in place.
+    All tokens are rows of one matrix, so that XLA can compute GELU in place.
     """
     rows = x.reshape(-1, x.shape[-1])
     if isinstance(params, Mlp):
@@ -782,9 +781,9 @@ def interpolate_positions(
     """Resize the stored grid of position embeddings as the public models do.
 
     Bicubic interpolation is linear and separable: two small matrix products, whose constants are
-    computed while tracing. One set of weights therefore serves every image size. Models without
+    computed during tracing. One set of weights therefore serves every image size. Models without
     registers use torch's bicubic (a = -0.75) with the scale (size + 0.1) / grid. Models with
-    registers use its antialiased one (a = -0.5) at the exact scale, but see `position_resize`.
+    registers use its antialiased one (a = -0.5) at the exact scale; see also `position_resize`.
     """
     antialias = config.registers and config.position_resize == "dinov2"
     return resize_grid(positions, grid, _antialias_weights if antialias else bicubic_weights)
@@ -795,7 +794,7 @@ def resize_grid(
     grid: Grid,
     weights: Callable[[int, int], Float[np.ndarray, "target source"]],
 ) -> Float[Array, "rows columns dim"]:
-    """Resize a square grid by the weights of each side."""
+    """Resize a square grid with the interpolation weights of each side."""
     side = positions.shape[0]
     if grid == (side, side):
         return positions
@@ -815,7 +814,7 @@ def _cubic(x: np.ndarray, a: float) -> np.ndarray:
 def bicubic_weights(source: int, target: int, more: float = 0.1) -> np.ndarray:
     """Compute (target, source) weights of torch's bicubic upsampling, with replicated borders.
 
-    The scale is that of a target longer by `more`, as DINOv2 has it.
+    The scale is that of a target longer by `more`, as in DINOv2.
     """
     scale = source / (target + more)
     centres = (np.arange(target) + 0.5) * scale - 0.5

@@ -1,4 +1,4 @@
-"""Sinkhorn's iteration at an epsilon that falls (Schmitzer, SIAM J. Sci. Comput. 2019)."""
+"""Sinkhorn's iteration with a falling epsilon (Schmitzer, SIAM J. Sci. Comput. 2019)."""
 
 import math
 from typing import Any, ClassVar
@@ -15,9 +15,9 @@ from crisalad_jax.nn.transport.steps import STEPS, Moved, Step, check_balanced, 
 class AnnealingStep(Step):
     """Take Sinkhorn's step at `start` times epsilon first, and at epsilon after `cooling` steps.
 
-    In between epsilon falls by the same factor each time. Problems must be balanced. The
-    iteration's number sets epsilon, so a warm start is heated again, and the gradient "optimistix"
-    never cools.
+    In between, epsilon falls by the same factor each time. Problems must be balanced. Epsilon
+    depends on the number of the iteration, so a warm start is heated again, and the gradient
+    "optimistix" never cools.
     """
 
     entropic: ClassVar[bool] = True
@@ -36,7 +36,7 @@ class AnnealingStep(Step):
         Raises:
             InputError: the problem's marginals are relaxed.
         """
-        check_balanced(problem, "annealing")  # what tau stands for changes with epsilon
+        check_balanced(problem, "annealing")  # the meaning of tau changes with epsilon
         left = jnp.maximum(1 - iteration / self.cooling, 0)
         times = jnp.asarray(self.start**left, problem.log_mu.dtype)
         smooth = tempered(problem, jnp.broadcast_to(times, problem.log_mu.shape[:-1]))
@@ -45,5 +45,5 @@ class AnnealingStep(Step):
         return Potentials(row, column), state
 
     def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
-        """Meet the rows' marginals at epsilon itself, wherever the schedule was left."""
+        """Meet the rows' marginals at epsilon itself, wherever the schedule stopped."""
         return potentials._replace(row=problem.log_mu - problem.lse_columns(potentials.column))

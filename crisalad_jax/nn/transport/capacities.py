@@ -14,8 +14,8 @@ class CapacityStep(Step):
     """Treat the columns' marginals as capacities: lower full columns, leave the others.
 
     The plan maximises <P, S> + epsilon * entropy(P) over plans that meet the rows' marginals and
-    exceed no column's (Benamou et al., SIAM J. Sci. Comput. 2015). A potential of the columns is
-    at most 0, and is 0 where a column is not full. The rows are met last.
+    exceed no column's (Benamou et al., SIAM J. Sci. Comput. 2015). A column's potential is at most
+    0, and is 0 if the column is not full. The rows' marginals are met last.
 
     Example:
         >>> from crisalad_jax.sinkhorn import SinkhornConfig, assign_with_dustbin

@@ -1,4 +1,4 @@
-"""Check a transport problem at the door, and what a custom step makes of it."""
+"""Check the inputs of a transport problem, and the outputs of custom steps and starts."""
 
 import contextlib
 from collections.abc import Callable
@@ -37,9 +37,9 @@ def check_inputs(
         scores: see `solve`.
         log_mu: see `solve`.
         log_nu: see `solve`.
-        numbers: epsilon and both taus, each for all problems or one for each; a tau of None is 1.
+        numbers: epsilon and both taus, each one for all problems or one per problem; None is 1.
         init: see `solve`.
-        equal_totals: whether both sides' masses must sum to the same.
+        equal_totals: whether the masses of both sides must have the same total.
 
     Raises:
         InputError: naming the argument, what was found and what was expected.
@@ -68,7 +68,7 @@ def check_inputs(
     for name, masses in (("log_mu", log_mu), ("log_nu", log_nu)):
         words = "found with NaN, infinity or no mass at all, expected finite numbers, or -inf for a"
         _check(f"{name} {words} mass of 0", _are_masses, masses)
-    least = float(jnp.finfo(wide).tiny)  # a processor may take less for 0
+    least = float(jnp.finfo(wide).tiny)  # a processor may flush less to 0
     epsilon, *taus = numbers
     shown = " ".join(str(epsilon).split())
     _check(f"epsilon found {shown}, expected at least {least:.1e}", lambda x: x >= least, epsilon)
@@ -97,12 +97,12 @@ def check_inputs(
 
 
 def per_problem(numbers: Array, axes: int) -> Array:
-    """Append axes to numbers of which there is one for each problem; one for all stays as it is."""
+    """Append axes to an array of one number per problem; one number for all stays as it is."""
     return jnp.expand_dims(numbers, tuple(range(-axes, 0))) if numbers.ndim else numbers
 
 
 def _check(words: str, test: Callable[..., Array], *values: Any) -> None:
-    """Raise InputError where a test of values fails somewhere; traced ones are not known."""
+    """Raise InputError if a test of the values fails anywhere; traced values pass."""
     if not any(isinstance(value, Tracer) for value in values):
         # Concrete values stay concrete under tracing. Only a flag is copied to the host.
         with jax.ensure_compile_time_eval():
@@ -115,9 +115,9 @@ def _are_masses(logarithms: Array) -> Array:
 
 
 def _rounding(*log_masses: Array) -> float:
-    """Bound the relative difference of totals whose masses' logarithms were rounded."""
+    """Bound the relative difference of totals that comes from rounding their log masses."""
     floats = [x.dtype for x in log_masses if jnp.issubdtype(x.dtype, jnp.floating)]
-    # At least what sums of float32 logarithms are off by.
+    # At least the error of sums of float32 logarithms.
     return max([1e-4, *(16 * float(jnp.finfo(dtype).eps) for dtype in floats)])
 
 

@@ -20,7 +20,7 @@ class Solution(NamedTuple):
     potentials: Potentials
     iterations: Int[Array, "*batch"]
     met: Bool[Array, "*batch"]
-    """Whether the tolerance was met; False where there is none."""
+    """Whether the tolerance was met; False if there is none."""
 
 
 class Gradient(Part):
@@ -28,12 +28,12 @@ class Gradient(Part):
 
     at_convergence: ClassVar[bool | None] = None
     """Whether it is the gradient of the converged plan, which needs a tolerance, or of a fixed
-    number of iterations, which has none; None goes with both."""
+    number of iterations, which has none; None fits both."""
     needs_entropic: ClassVar[bool] = False
     """Whether the step must solve the entropic problem (`Step.entropic`)."""
     takes_solver: ClassVar[bool] = False
-    """Whether `solve` takes the solver that is given to `sinkhorn.solve`, which accelerates in the
-    place of Anderson's method."""
+    """Whether `solve` takes the solver that is given to `sinkhorn.solve`, which then accelerates
+    instead of Anderson's method."""
 
     def solve(
         self, problem: Problem, config: "SinkhornConfig", params: Any, init: Potentials
@@ -64,7 +64,7 @@ class SinkhornConfig:
     """Largest error of a step at which iterations stop. For plain steps it is the relative marginal
     error before the last step. float32 may never get below 1e-5."""
     throw: bool = False
-    """Whether to raise where the tolerance is not met; else the result says so."""
+    """Whether to raise if the tolerance is not met; else the result says so."""
     domain: Literal["scaling", "log"] = "scaling"
     """Domain of the sums. Scaling computes exponentials once; problems whose scores are too far
     apart for it are solved again in the log domain."""
@@ -75,10 +75,10 @@ class SinkhornConfig:
     optimality conditions), optimistix (fixed point and adjoint of that library), or stop
     (potentials are constants)."""
     start: OrName[Start] = part_field(STARTS, "zeros")
-    """Potentials to start from, where no `init` is given; a registered start, or its name."""
+    """Potentials to start from if no `init` is given; a registered start, or its name."""
 
     def __post_init__(self) -> None:
-        """Check the ranges, and that the parts go together."""
+        """Check the ranges, and that the parts are compatible."""
         resolve_names(self)
         gradient, converges = self.gradient, self.tolerance is not None
         remembers = self.anderson_memory > 1 and not gradient.takes_solver

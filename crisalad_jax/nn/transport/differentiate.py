@@ -18,7 +18,7 @@ def solve_in_domain(
     problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
 ) -> Solution:
     """Iterate in the configured domain; scores too far apart for scaling use the log domain."""
-    # Out of its range the other domain is left, by a branch.
+    # Leaving the scaling domain, out of its range, takes a branch.
     if config.domain == "log" or not target().branches:
         return iterate(problem, config, params, init)
     scaled = ScalingProblem.scaled(problem)
@@ -47,14 +47,14 @@ def solve_in_domain(
 
 @GRADIENTS.register("unrolled")
 class Unrolled(Gradient):
-    """Differentiate through the iterations: the exact gradient of their number."""
+    """Differentiate through the iterations: the exact gradient for their number."""
 
     at_convergence: ClassVar[bool | None] = False
 
     def solve(
         self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
     ) -> Solution:
-        """Solve by plain JAX operations, which have all derivatives in any mode."""
+        """Solve with plain JAX operations, which have all derivatives in every mode."""
         return solve_in_domain(problem, config, params, init)
 
 
@@ -80,14 +80,14 @@ class Implicit(Stop):
     def solve(
         self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
     ) -> Solution:
-        """Solve, with the derivative of the solution."""
+        """Solve, and attach the derivative of the solution."""
         solution = super().solve(problem, config, params, init)
         return solution._replace(potentials=_at_solution(problem, solution.potentials))
 
 
 @jax.custom_jvp
 def _at_solution(problem: Problem, potentials: Potentials) -> Potentials:
-    """Return the given potentials, with the derivative of the solution that they are."""
+    """Return the given potentials, which are a solution, with the derivative of that solution."""
     return potentials
 
 
@@ -159,7 +159,7 @@ class Optimistix(Gradient):
                 # Centre the potentials to make the fixed point unique.
                 if problem.balanced and not config.step.capacities:
                     moved = centred(problem, moved)
-                # 0 for what has no mass: a solver may multiply, and the floor would overflow.
+                # 0 where there is no mass: a solver may multiply, and `EMPTY` would overflow.
                 return problem.masked(moved, 0.0)
 
             fixed_point = optimistix.fixed_point(
@@ -183,7 +183,7 @@ class Optimistix(Gradient):
 
 
 def centred(problem: Problem, potentials: Potentials) -> Potentials:
-    """Shift the columns with mass to a mean of 0, which leaves the plan the same."""
+    """Shift the potentials of columns with mass to a mean of 0, which leaves the plan the same."""
     _, empty = problem.empty
     total = jnp.where(empty, 0, potentials.column).sum(axis=-1, keepdims=True)
     shift = total / jnp.maximum((~empty).sum(axis=-1, keepdims=True), 1)

@@ -29,23 +29,23 @@ def sinkhorn_divergence(
     KL(plan | product of the masses) for squared Euclidean costs |x - y|^2. It is 0 for equal sets,
     never negative at convergence, and nears the squared Wasserstein distance as epsilon falls.
 
-    The gradient is Danskin's: potentials are constants, as they maximise the dual. It is exact at
-    convergence, needs no iteration's memory, and cannot be differentiated again.
+    The gradient is Danskin's: potentials are constants, because they maximise the dual. It is exact
+    at convergence, stores no iterations, and cannot be differentiated again.
 
     Args:
         x: tokens of one image of each pair.
         y: tokens of the other, of the same width.
-        log_mu: logarithms of the masses of `x`, -inf for a token that does not count; by default
-            all are equal. They are normalised to sum to 1.
-        log_nu: the same of `y`.
+        log_mu: logarithms of the masses of `x`, -inf for a token to leave out; by default all are
+            equal. They are normalised to sum to 1.
+        log_nu: the same for `y`.
         epsilon: entropic regularisation, in units of the cost.
-        config: the solver, of which the potentials alone are used.
+        config: the solver, of which only the potentials are used.
 
     Returns:
         The divergence of each pair, in float32 at least.
 
     Raises:
-        InputError: tokens of other widths or batches, or what `solve` raises.
+        InputError: the tokens differ in width or batch; or as `solve`.
 
     Example:
         >>> x = jnp.eye(3)
@@ -77,11 +77,11 @@ def entropic_cost(
     epsilon: float | Float[Array, "*#batch"],
     config: SinkhornConfig = _SOLVER,
 ) -> Float[Array, "*batch"]:
-    """Compute OT(x, y) of `sinkhorn_divergence`, whose gradient it has.
+    """Compute OT(x, y) of `sinkhorn_divergence`, with the same gradient.
 
     Args:
         first: tokens, and the logarithms of their masses, which sum to 1.
-        second: the same of the other image.
+        second: the same for the other image.
         epsilon: see `sinkhorn_divergence`.
         config: see `sinkhorn_divergence`.
     """
@@ -90,7 +90,7 @@ def entropic_cost(
     fixed = jax.lax.stop_gradient((-cost, log_mu, log_nu))
     at = jax.lax.stop_gradient(epsilon)
     row, column = solve(*fixed, epsilon=at, config=config).potentials
-    # The dual's potentials count from the masses.
+    # The dual's potentials are relative to the masses.
     f = jax.lax.stop_gradient(_from_masses(row, log_mu))
     g = jax.lax.stop_gradient(_from_masses(column, log_nu))
     mu, nu = jnp.exp(log_mu), jnp.exp(log_nu)

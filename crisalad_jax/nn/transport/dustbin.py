@@ -1,8 +1,8 @@
 """Dustbins, which take the patches that belong to no cluster, and their marginals.
 
-The mass of a dustbin is decided here, in `marginals`: what the clusters leave for "column" and
-"token" (`log_marginals`), all patches for "row and column", a learnt share for "mass". The score
-that it appends is another thing.
+The mass of a dustbin is set here, in `marginals`: what the clusters leave for "column" and "token"
+(`log_marginals`), all patches for "row and column", a learnt share for "mass". It is separate from
+the score that the dustbin appends.
 """
 
 import math
@@ -41,13 +41,13 @@ class Dustbin(Part):
     takes_difference: ClassVar[bool] = False
     """Whether its mass is the number of patches minus that of clusters, which must be positive."""
     capacities: ClassVar[bool] = False
-    """Whether its clusters may take less than their masses, which not every step can solve."""
+    """Whether its clusters may take less than their masses, which not every step supports."""
 
     def init(self, key: PRNGKeyArray, dim: int) -> Any:
         """Return the initial parameters, a pytree of arrays; by default None.
 
         Args:
-            key: draws it.
+            key: random key.
             dim: width of a patch's features.
         """
         return None
@@ -61,8 +61,8 @@ class Dustbin(Part):
         """Return the scores that include the dustbin, and all masses.
 
         Args:
-            params: the learnt parameters, or an array of the shape that the dustbin asks for.
-            scores: of each patch for each cluster, in float32 at least.
+            params: the learnt parameters, or an array of the shape that the dustbin expects.
+            scores: scores of each patch for each cluster, in float32 at least.
             patches: the patches' features; None outside of a model.
         """
         raise NotImplementedError
@@ -72,7 +72,7 @@ DUSTBINS = Registry("dustbin", Dustbin)
 
 
 def check_params(params: Any, *shape: int) -> Array:
-    """Return a dustbin's parameters, an array of this shape."""
+    """Return a dustbin's parameters, which must be an array of this shape."""
     found = jnp.shape(params) if params is not None else None
     require(found == shape, f"dustbin: found parameters of shape {found}, expected {shape}")
     return jnp.asarray(params)
@@ -83,34 +83,34 @@ class NoDustbin(Dustbin):
     """No dustbin: the clusters share the patches' mass equally."""
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
-        """Return the scores as they are."""
+        """Return the scores unchanged."""
         rows, clusters = scores.shape[-2:]
         log_nu = jnp.full(clusters, math.log(rows / clusters), scores.dtype)
         return Marginals(scores, jnp.zeros(rows, scores.dtype), log_nu)
 
 
 class ScalarDustbin(Dustbin):
-    """What dustbins of one learnt number share."""
+    """Base class of dustbins with one learnt number."""
 
     def init(self, key: PRNGKeyArray, dim: int) -> Array:
-        """Start at 1: a score as the public implementation's, or a logit, whose share is 0.73."""
+        """Start at 1: the score of the public implementation, or a logit whose share is 0.73."""
         return jnp.ones(())
 
 
 @DUSTBINS.register("column")
 class ColumnDustbin(ScalarDustbin):
-    """A column of one learnt score, as published; plain iterations do not depend on the score."""
+    """A column with one learnt score, as published; plain iterations do not depend on the score."""
 
     takes_difference: ClassVar[bool] = True
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
-        """Append a column of the score."""
+        """Append a column with the score."""
         return _with_column(scores, check_params(params))
 
 
 @DUSTBINS.register("row and column")
 class RowAndColumnDustbin(ScalarDustbin):
-    """A row and a column of one learnt score, as SuperGlue has them (Sarlin et al., CVPR 2020)."""
+    """A row and a column with one learnt score, as in SuperGlue (Sarlin et al., CVPR 2020)."""
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append the column, then the row."""
@@ -125,13 +125,13 @@ class RowAndColumnDustbin(ScalarDustbin):
 
 @DUSTBINS.register("token")
 class TokenDustbin(Dustbin):
-    """A score that the score network gives each patch."""
+    """A dustbin score for each patch, from the score network."""
 
     scores: ClassVar[int] = 1
     takes_difference: ClassVar[bool] = True
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
-        """Use each patch's last score as the dustbin's, or `params` of one score a patch."""
+        """Use each patch's last score as the dustbin's, or `params` with one score per patch."""
         if params is None:
             scores, params = scores[..., :-1], scores[..., -1]
         return _with_column(scores, check_params(params, *scores.shape[:-1]))
@@ -139,9 +139,9 @@ class TokenDustbin(Dustbin):
 
 @DUSTBINS.register("mass")
 class MassDustbin(ScalarDustbin):
-    """A column of learnt mass, as the logit of its share; clusters share the rest equally.
+    """A column with learnt mass, as the logit of its share; clusters share the rest equally.
 
-    The first share is 0.73; the published one at 224 x 224 is 0.75.
+    The initial share is 0.73; the published one at 224 x 224 is 0.75.
     """
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
@@ -165,11 +165,11 @@ def append_dustbin(
     """Append a column of the dustbin's score to the scores (paper Eq. 4).
 
     Args:
-        scores: of each row for each cluster.
-        dustbin: one score for all rows, or one a row.
+        scores: scores of each row for each cluster.
+        dustbin: one score for all rows, or one per row.
 
     Returns:
-        The scores with one column more.
+        The scores with one more column.
 
     Example:
         >>> import jax.numpy as jnp
@@ -189,7 +189,7 @@ def log_marginals(
     Args:
         rows: number of patches.
         clusters: number of clusters, without the dustbin.
-        dtype: of the result.
+        dtype: type of the result.
 
     Returns:
         Logarithms of the rows' masses, and of the columns', the dustbin last.

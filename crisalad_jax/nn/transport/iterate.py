@@ -1,6 +1,6 @@
 """Iterate a fixed number of steps, or until the step's error is within the tolerance.
 
-If asked to, accelerate the potentials by Anderson's method (J. ACM 1965).
+Optionally, accelerate the potentials by Anderson's method (J. ACM 1965).
 """
 
 import functools
@@ -21,8 +21,8 @@ from crisalad_jax.nn.transport.problem import (
 from crisalad_jax.utils.target import target
 
 UNROLLED = 8
-"""Largest number of iterations that are unrolled for an accelerator's compiler; more are a scan, as
-all are on a CPU, which is as fast and compiles less."""
+"""Largest number of iterations that are unrolled on an accelerator; more become a scan. On a
+CPU all are a scan, which is as fast and compiles less."""
 
 
 _flat = functools.partial(jnp.concatenate, axis=-1)
@@ -40,16 +40,16 @@ class Memory(NamedTuple):
 def empty_memory(start: Potentials, size: int) -> Memory:
     """Return an empty memory with room for `size` iterations."""
     images = _flat(start)[..., None, :].repeat(size, axis=-2)
-    # Moves of 0: those of a start that is not 0 would count in the weights of the first steps.
+    # Moves of 0: a start that is not 0 would otherwise count in the weights of the first steps.
     return Memory(start, images, 0 * images)
 
 
 def accelerate(memory: Memory, moved: Potentials, count: Int[Array, ""]) -> Memory:
-    """Store a step, and start the next at the mixture of past results with the least residual.
+    """Store a step, and start the next from the mixture of past results with least residual.
 
     Args:
-        memory: the steps before.
-        moved: the potentials that the step made of `memory.start`.
+        memory: the previous steps.
+        moved: the potentials that the step returned for `memory.start`.
         count: number of steps before this one.
     """
     image = _flat(moved)
@@ -88,21 +88,21 @@ class _Progress(NamedTuple):
 def iterate(
     problem: Problem, config: SinkhornConfig, params: Any = None, init: Potentials | None = None
 ) -> Solution:
-    """Iterate a step on a problem, without a gradient rule of its own.
+    """Iterate a step on a problem, without a custom gradient rule.
 
     A problem that has converged no longer changes, so the result does not depend on its batch.
 
     Args:
         problem: scores and marginals.
         config: the step, the number of iterations, and when to stop.
-        params: what the step learns.
+        params: learnt parameters of the step.
         init: potentials to start from; None starts from zeros.
 
     Returns:
         The potentials, how many iterations it took, and whether the tolerance was met.
 
     Raises:
-        InputError: while tracing, for a step that returns other potentials than it was given.
+        InputError: while tracing, if the step returns potentials unlike the given ones.
 
     Example:
         >>> import jax.numpy as jnp
@@ -142,7 +142,7 @@ def iterate(
 
         def unfinished(at: _Progress) -> Bool[Array, ""]:
             active = (at.error > tolerance) & (at.iterations < config.iterations)
-            # Out of its range the scaling domain is not waited for: the log domain solves again.
+            # Out of range, the scaling domain stops at once: the log domain solves again.
             return active.any() & (not isinstance(problem, ScalingProblem) or problem.in_range)
 
         progress = jax.lax.while_loop(unfinished, advance, progress)

@@ -11,7 +11,7 @@ from crisalad_jax.nn.transport.steps import STEPS, Step
 
 
 class Momentum(NamedTuple):
-    """What Nesterov's step remembers."""
+    """The state of Nesterov's step."""
 
     column: Columns
     """Column potentials of the last iteration, before they were extrapolated."""
@@ -25,15 +25,15 @@ class NesterovStep(Step):
 
     With the rows met, Sinkhorn's update of the columns is a mirror step of length 1 on the
     semi-dual, which Nesterov's method accelerates (Soviet Math. Dokl. 1983; Xu and Chen,
-    arXiv:2605.30267, have such a method with a proven rate). Here it is the plain extrapolation by
-    t / (t + 3), where t starts again when the last move was against the gradient (O'Donoghue and
-    Candes, Found. Comput. Math. 2015). The weights pass no gradient.
+    arXiv:2605.30267, have such a method with a proven rate). Here it is a plain extrapolation by
+    t / (t + 3), where t restarts when the last move was against the gradient (O'Donoghue and
+    Candes, Found. Comput. Math. 2015). No gradient flows through the weights.
     """
 
     entropic: ClassVar[bool] = True
 
     def init(self, problem: Problem, params: Any) -> Momentum:
-        """Start without a last move."""
+        """Start without a previous move."""
         zeros = problem.zeros().column
         return Momentum(zeros, 0 * zeros[..., 0])
 

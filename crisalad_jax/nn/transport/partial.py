@@ -1,10 +1,10 @@
-"""Partial transport: only a share of the patches' mass moves, and the dustbin is what stays.
+"""Partial transport: only a share of the patches' mass moves, and the dustbin is the rest.
 
 Entropic partial transport (Benamou et al., SIAM J. Sci. Comput. 2015) maximises <P, S> + epsilon *
-entropy(P) over plans P between patches and clusters that move a given total mass, take at most
-its mass from a patch and bring at most its mass to a cluster. In the log domain P is
-exp(kernel + row + column), where no row potential is above 0, and no column potential above a level
-that all clusters share. The level is such that the total is met.
+entropy(P) over plans P between patches and clusters that move a given total mass, and never exceed
+the mass of a patch or cluster. In the log domain P is exp(kernel + row + column), where row
+potentials are at most 0, and column potentials at most a level that all clusters share, at which
+the total is met.
 """
 
 import math
@@ -97,14 +97,14 @@ class PartialStep(Step):
         """Append what each patch keeps to what it moves."""
         moved = problem.log_plan(potentials)[..., :-1]
         share = jax.nn.logsumexp(moved, axis=-1) - problem.log_mu
-        # Rows that give all have a negative potential; what rounding leaves of them is not kept.
+        # Rows that give all have a negative potential; what rounding leaves of them is dropped.
         some = (potentials.row >= 0) & (share < -jnp.finfo(share.dtype).eps)
         kept = problem.log_mu + jnp.log(-jnp.expm1(jnp.where(some, share, -1)))
         return jnp.concatenate([moved, jnp.where(some, kept, EMPTY)[..., None]], axis=-1)
 
 
 def _fill(sums: Columns, log_nu: Columns, total: Float[Array, "*batch"]) -> Columns:
-    """Return potentials that give columns a total mass, each at most its own.
+    """Return potentials that give the columns a total mass, each at most its own.
 
     Columns that are not full share one potential, the level. The columns' masses are
     exp(potential + sums).

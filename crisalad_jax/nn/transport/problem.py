@@ -15,15 +15,15 @@ SCALING_RANGE = 60
 """Largest difference of two scores of a row, over epsilon, that the scaling domain is exact for.
 
 Within it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
-exp(-87), is no part of such a sum's last place."""
+exp(-87), does not reach the last place of such a sum."""
 
 LOG_ZERO = -1e5
-"""Logarithm below which a mass is 0: no format of floats holds exp(-1e5)."""
+"""Logarithm below which a mass is 0: no float format can hold exp(-1e5)."""
 EMPTY = -1e30
 """Logarithm that stands for a mass of 0, and the potential of such a row or column.
 
-It is finite, so that differences and gradients are; and so low that numbers of the size of
-potentials vanish in a sum with it.
+It is finite, so that differences and gradients are too, and so low that adding numbers of the size
+of potentials does not change it.
 """
 
 
@@ -44,17 +44,17 @@ class Potentials(NamedTuple):
 class Problem:
     """Scores and marginals of entropic transport, with sums taken in the log domain.
 
-    The last column is stored apart, because it is mostly an appended dustbin. The compiler then
-    need not write out the joined matrix, and the other columns keep a power of two.
+    The last column is stored separately, because it is usually an appended dustbin. The compiler
+    then need not write out the joined matrix, and the number of other columns stays a power of two.
 
     Attributes:
         clusters: all columns but the last of the scores over epsilon.
         last: the last column.
         log_mu: logarithms of the rows' masses; `EMPTY` for a mass of 0.
-        log_nu: the same of the columns' masses.
-        taus: of the rows and of the columns. None where they meet their marginals exactly; else an
-            array of shape (*batch, 1), below 1, by which a Kullback-Leibler penalty of weight
-            epsilon * tau / (1 - tau) draws them there (Chizat et al., Math. Comp. 2018).
+        log_nu: the same for the columns' masses.
+        taus: for the rows and for the columns. None if they meet their marginals exactly; else an
+            array of shape (*batch, 1), below 1: a Kullback-Leibler penalty of weight
+            epsilon * tau / (1 - tau) pulls them there (Chizat et al., Math. Comp. 2018).
 
     Example:
         >>> problem = Problem.of(jnp.eye(2), jnp.zeros(2), jnp.zeros(2))
@@ -77,9 +77,9 @@ class Problem:
         row_tau: float | Array = 1.0,
         column_tau: float | Array = 1.0,
     ) -> "Problem":
-        """Make a problem of the scores over epsilon and the logarithms of the masses.
+        """Make a problem from the scores over epsilon and the logarithms of the masses.
 
-        A mass of 0 has the logarithm -inf, or any below -1e5. A tau that is an array is that of
+        The logarithm of a mass of 0 is -inf, or any below -1e5. A tau that is an array is from
         another problem, or has one number.
         """
         one = (*kernel.shape[:-2], 1)
@@ -103,7 +103,7 @@ class Problem:
 
     @property
     def column_tau(self) -> float | Array:
-        """The same of the columns."""
+        """The same for the columns."""
         return 1.0 if self.taus[1] is None else self.taus[1]
 
     @property
@@ -126,7 +126,7 @@ class Problem:
 
         Args:
             potentials: of all rows and columns.
-            value: what to set; by default `EMPTY`, with which they are in no sum and no plan.
+            value: value to set; the default `EMPTY` leaves them out of every sum and plan.
         """
         pairs = zip(self.empty, potentials, strict=True)
         return Potentials(*(jnp.where(empty, value, x) for empty, x in pairs))
@@ -140,8 +140,8 @@ class Problem:
         return jax.nn.logsumexp(self.kernel + row[..., :, None], axis=-2)
 
     def log_plan(self, potentials: Potentials) -> Matrix:
-        """Return the logarithm of the plan that the potentials make."""
-        # Where one side has no mass at all, the other's potentials must not make up for it.
+        """Return the logarithm of the plan with these potentials."""
+        # If one side has no mass at all, the other's potentials must not make up for it.
         most = -EMPTY / 4
         row, column = (jnp.where((x > most) & (x < jnp.inf), most, x) for x in potentials)
         clusters = self.clusters + row[..., :, None] + column[..., None, :-1]
@@ -160,8 +160,8 @@ class ScalingProblem(Problem):
         row_max: each row's largest score.
         gibbs: exp(clusters - row_max).
         gibbs_last: exp(last - row_max).
-        in_range: whether the scores are close enough for the sums to be exact. Elsewhere all sums
-            are finite but wrong.
+        in_range: whether the scores are close enough for the sums to be exact. If not, all sums are
+            finite but wrong.
     """
 
     row_max: Rows = dataclasses.field(kw_only=True)

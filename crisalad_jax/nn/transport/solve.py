@@ -40,17 +40,17 @@ class SinkhornResult(NamedTuple):
     """Potentials, in balanced transport unique up to a constant: the columns' mean is 0.
 
     Pass them as `init` to start the next solve. Rows and columns of mass 0 have very low ones,
-    which are in no mean."""
+    which do not count in the mean."""
     row_error: Float[Array, "*batch"]
     """Largest difference between a row's mass and its marginal, relative to the marginal; a row of
     marginal 0 has none."""
     column_error: Float[Array, "*batch"]
-    """Largest relative error of a column's mass. Rows are updated last, so iterations lower it."""
+    """Largest relative error of a column's mass. Rows are updated last, so iterations reduce it."""
     iterations: Int[Array, "*batch"]
-    """Number of iterations that were taken."""
+    """Number of iterations taken."""
     converged: Bool[Array, "*batch"]
     """Whether there is a tolerance and it was met. Both errors of a balanced entropic problem are
-    then within it, too. False without a tolerance, where nothing is known of convergence."""
+    then within it, too. False without a tolerance, as convergence is then unknown."""
     finite: Bool[Array, "*batch"]
     """Whether the potentials are finite."""
 
@@ -71,15 +71,15 @@ def solve(
 ) -> SinkhornResult:
     """Solve the entropic transport problem.
 
-    The plan is that of the largest <plan, scores> + epsilon * entropy for the given marginals
-    (paper Eq. 5). By default the algorithm is the published one: three times the two projections,
-    columns first and rows last, from zero potentials. Scores of half precision are widened to
-    float32. For finite scores the result is finite and does not depend on the domain: scores too
-    far apart for the scaling domain are solved again in the log domain.
+    The plan maximises <plan, scores> + epsilon * entropy for the given marginals (paper Eq. 5). By
+    default the algorithm is the published one: three iterations of the two projections, columns
+    first and rows last, from zero potentials. Scores of half precision are widened to float32. For
+    finite scores the result is finite and does not depend on the domain: scores too far apart for
+    the scaling domain are solved again in the log domain.
 
     Rows and columns may have a mass of 0. Their entries of the plan and their gradients are then 0,
-    and the rest is the problem without them. The logarithm of such an entry is finite, and so low
-    that its exponential is 0.
+    and the rest is as without them. The logarithm of such an entry is finite, and so low that its
+    exponential is 0.
 
     Every gradient but "optimistix" works in forward and reverse mode, and has higher derivatives.
     Under `vmap` every problem is solved in both domains: put a batch in the leading axes instead.
@@ -87,19 +87,18 @@ def solve(
     Args:
         scores: finite; the gain of moving mass from a row to a column.
         log_mu: logarithms of the rows' masses; -inf, or any below -1e5, for a mass of 0.
-        log_nu: logarithms of the columns' masses; where the step is `entropic` and neither
-            tau below 1 they sum to the same. Totals of half-precision masses may differ by their
-            rounding: the columns take the rows' total.
+        log_nu: logarithms of the columns' masses. If the step is `entropic` and neither tau is
+            below 1, the masses must have the rows' total. Totals of half-precision masses may
+            differ by their rounding: the columns then get the rows' total.
         epsilon: entropic regularisation, above 0: one for all problems of the batch, or one for
             each. It may be traced or learnt.
         row_tau: 1 for rows that meet their marginals; below 1 a Kullback-Leibler penalty of
-            epsilon * row_tau / (1 - row_tau) draws them there. An array, of one number or one for
+            epsilon * row_tau / (1 - row_tau) pulls them there. An array, of one number or one for
             each problem, may be traced or learnt, and must stay below 1.
         column_tau: the same for columns.
-        config: step, stopping and gradient. Static.
-        init: potentials to start from, such as an earlier result's; by default those
-            of `config.start`. Those of
-            rows and columns of mass 0 are not used.
+        config: step, stopping rule and gradient. Static.
+        init: potentials to start from, such as those of an earlier result; by default those of
+            `config.start`. Those of rows and columns of mass 0 are not used.
         step_params: learnt parameters of the step (`Step.init_params`).
         start_params: learnt parameters of the start (`Start.init_params`).
         solver: an optimistix solver, where the gradient is "optimistix".
@@ -108,12 +107,12 @@ def solve(
         The plan's logarithm, the potentials, and how well the plan meets its marginals.
 
     Raises:
-        InputError: complex scores, shapes that do not fit, a tau out of range, a
-            step that returns anything but such potentials; and where values are known (outside of
-            `jit` and `grad`): scores that are not finite, an `init` with NaN, masses that are NaN
-            or infinite or all 0, masses that sum to different totals, an epsilon of 0 or less or
-            too small; or `config.throw`, and a tolerance that was not met. Inside of `jit` the last
-            is a RuntimeError of the compiled program, and only if it uses a value of the result.
+        InputError: complex scores, shapes that do not fit, a tau out of range, or a step whose
+            potentials do not fit the problem; if values are known (outside of `jit` and `grad`),
+            scores that are not finite, an `init` with NaN, masses that are NaN or infinite or all
+            0, masses with different totals, or an epsilon that is not positive or too small; or,
+            with `config.throw`, a tolerance that was not met. Inside of `jit` the last is a
+            RuntimeError of the compiled program, raised only if it uses a value of the result.
 
     Example:
         >>> import jax.numpy as jnp
@@ -127,7 +126,7 @@ def solve(
         None if isinstance(tau, (int, float)) and tau == 1 else tau for tau in (row_tau, column_tau)
     )
     taus: tuple[Any, Any] = row, column
-    # Totals may differ for a step of another problem, such as one with column capacities.
+    # Totals may differ if the step solves another problem, such as one with column capacities.
     equal = _balanced(taus) and config.step.entropic
     check_inputs(scores, log_mu, log_nu, (epsilon, *taus), init, equal_totals=equal)
     arguments = scores, log_mu, log_nu, epsilon, init, step_params, start_params, taus, config
@@ -210,15 +209,15 @@ def assign_with_dustbin(
     patches: Float[Array, "*batch patches dim"] | None = None,
     **options: Any,
 ) -> SinkhornResult:
-    """Assign patches to clusters by transport, with a dustbin for patches of no cluster.
+    """Assign patches to clusters by transport, with a dustbin for patches that belong to none.
 
     Args:
-        scores: of each patch for each cluster.
+        scores: scores of each patch for each cluster.
         params: learnt parameters of the dustbin. "column" and "row and column": its one score;
-            "token": a score a patch; "mass": the logit of the dustbin's share of all mass, the rest
-            being shared by the clusters alike; "none": None.
+            "token": a score per patch; "mass": the logit of the dustbin's share of all mass, where
+            the clusters share the rest equally; "none": None.
         dustbin: a registered dustbin, or its name.
-        patches: features of the patches, for dustbins that look at them.
+        patches: features of the patches, for dustbins that use them.
         **options: those of `solve`, from `epsilon` on.
 
     Returns:
@@ -226,9 +225,9 @@ def assign_with_dustbin(
         dustbin.
 
     Raises:
-        InputError: what `solve` raises; no more patches than clusters where the dustbin's mass is
-            their difference; parameters of another shape than the dustbin's; or a dustbin with
-            capacities and a step without.
+        InputError: as `solve`; or the dustbin's mass is the number of patches minus that of
+            clusters and is not positive; the parameters do not have the dustbin's shape; or the
+            dustbin has capacities and the step does not.
 
     Example:
         >>> import jax.numpy as jnp

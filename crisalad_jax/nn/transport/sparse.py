@@ -48,12 +48,12 @@ class QuadraticStep(Step):
 def simplex_offset(scores: Matrix, mass: Rows) -> Rows:
     """Return what to add to each row so that its positive parts sum to its mass.
 
-    That is the projection onto the simplex of this mass, sparsemax (Martins and Astudillo, ICML
+    This is the projection onto the simplex of this mass, sparsemax (Martins and Astudillo, ICML
     2016).
 
     Args:
         scores: rows of numbers.
-        mass: of each row.
+        mass: mass of each row.
 
     Example:
         >>> simplex_offset(jnp.array([[1.0, 0.5, -3.0]]), jnp.ones(1)).tolist()
@@ -68,10 +68,10 @@ def simplex_offset(scores: Matrix, mass: Rows) -> Rows:
 
 @STEPS.register("top-k")
 class TopKStep(SinkhornStep):
-    """Sinkhorn's step; of the plan each row keeps its k largest entries, scaled to the row's mass.
+    """Sinkhorn's step; each row of the plan keeps its k largest entries, scaled to the row's mass.
 
-    Columns then miss their marginals by what was cut, which `column_error` has. It is a rounding of
-    the entropic plan, not the best plan of that many entries.
+    Columns then miss their marginals by what was cut, as `column_error` shows. This rounds the
+    entropic plan, and is not the best plan with that many entries.
     """
 
     entropic = False

@@ -1,4 +1,4 @@
-"""Where a solver starts: at zeros, at a Gaussian guess, or where a small network says."""
+"""Where a solver starts: at zeros, at a Gaussian guess, or at the output of a small network."""
 
 import abc
 from typing import Any
@@ -35,8 +35,8 @@ class Start(Part, abc.ABC):
     def potentials(self, problem: Problem, params: Any) -> Potentials:
         """Return the potentials of rows and columns to start from.
 
-        Steps update the columns first, from the rows: give rows that fit the columns
-        (`from_columns`). The gradient "unrolled" goes through the start; that of a converged
+        Steps update the columns first, from the rows: return rows that fit the columns
+        (`from_columns`). The gradient "unrolled" flows through the start; that of a converged
         solution does not depend on it.
         """
 
@@ -45,7 +45,7 @@ STARTS = Registry("start", Start)
 
 
 def from_columns(problem: Problem, column: Columns) -> Potentials:
-    """Complete the columns' potentials by those of rows that meet their marginals.
+    """Complete potentials of the columns with those of rows that meet their marginals.
 
     Args:
         problem: the transport problem.
@@ -77,12 +77,12 @@ class ZeroStart(Start):
 class GaussianStart(Start):
     """Start at the potentials of two Gaussians, in closed form from the scores' spectrum.
 
-    A matrix of scores is, but for means of its rows and columns, one of inner products <x_n, y_k>,
-    by its singular vectors. Were x and y Gaussian, the entropic plan would be one too, and its
-    potentials quadratic (Janati et al., NeurIPS 2020; Thornton and Cuturi, AISTATS 2023, start
-    from them). With masses that sum to 1 and G the columns' weighted second moments of the scores,
-    the columns' potential is log nu - mean - (sqrt(1 + 4 G) - 1)_kk / (4 nu_k): for small scores
-    half a variance. It costs a product of the scores with themselves and an eigendecomposition.
+    Up to means of its rows and columns, a matrix of scores is one of inner products <x_n, y_k>, by
+    its singular vectors. If x and y were Gaussian, the entropic plan would be too, with quadratic
+    potentials (Janati et al., NeurIPS 2020; Thornton and Cuturi, AISTATS 2023, start from them).
+    With masses that sum to 1, and G the columns' weighted second moments of the scores, the
+    columns' potential is log nu - mean - (sqrt(1 + 4 G) - 1)_kk / (4 nu_k): for small scores, half
+    a variance. It costs a product of the scores with themselves and an eigendecomposition.
     """
 
     def potentials(self, problem: Problem, params: Any) -> Potentials:
@@ -111,7 +111,7 @@ def _root(moments: Array) -> Array:
 
 @_root.defjvp
 def _root_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    """Solve X dX + dX X = 4 dG, which equal eigenvalues do not harm: roots are at least 1."""
+    """Solve X dX + dX X = 4 dG, even for equal eigenvalues: roots are at least 1."""
     (moments,), (change,) = primals, tangents
     values, vectors = jnp.linalg.eigh(moments)
     roots = jnp.sqrt(1 + 4 * jnp.maximum(values, 0))
@@ -124,9 +124,9 @@ def _root_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 class NetworkStart(Start):
     """Start at Sinkhorn's first columns, moved by a small network of each column's statistics.
 
-    Learnt starts are those of Amos et al. (Meta optimal transport, ICML 2023). Of every column the
-    network gets the first potential, and mean, deviation and maximum of its scores; it moves no
-    column at first. Its gradient is that of "unrolled": with others it does not learn.
+    Learnt starts are from Amos et al. (Meta optimal transport, ICML 2023). For each column, the
+    network gets the first potential, and the mean, deviation and maximum of its scores; initially
+    it moves no column. It learns only with the gradient "unrolled".
     """
 
     hidden: PositiveInt = 16
@@ -147,7 +147,7 @@ class NetworkStart(Start):
         rows = jax.nn.softmax(problem.log_mu, axis=-1)
         mean = product("...n,...nk->...k", rows, kernel)
         variance = product("...n,...nk->...k", rows, (kernel - mean[..., None, :]) ** 2)
-        # The floor: a constant column has a deviation without a gradient.
+        # The floor is for constant columns, whose deviation has no gradient.
         deviation = jnp.sqrt(variance + jnp.finfo(kernel.dtype).eps)
         inputs = jnp.stack([first, mean, deviation, kernel.max(axis=-2)], axis=-1)
         _, empty = problem.empty

@@ -28,7 +28,7 @@ Moved = tuple[Potentials, Any]
 class Step(Part, abc.ABC):
     """One iteration of a transport solver: a frozen dataclass whose fields are its settings.
 
-    `step` alone is required. Stopping, acceleration and gradients use the methods and attributes of
+    Only `step` is required. Stopping, acceleration and gradients use the methods and attributes of
     a step, never its name.
 
     Example:
@@ -47,18 +47,18 @@ class Step(Part, abc.ABC):
     """Whether the fixed point is the entropic plan of the problem. The closed-form gradient
     requires it, and such a step counts as converged only if its marginals are met."""
     capacities: ClassVar[bool] = False
-    """Whether columns may take less than their marginals. No constant of the potentials is then
-    free, and a result's `column_error` is the largest excess."""
+    """Whether columns may take less than their marginals. The potentials then have no free
+    constant, and a result's `column_error` is the largest excess."""
 
     def init_params(self, key: PRNGKeyArray) -> Any:
         """Return the step's initial parameters, a pytree of arrays; by default None."""
         return None
 
     def prepare(self, problem: Problem, params: Any) -> Problem:
-        """Return the problem to solve, of the same shapes; by default the one that is given.
+        """Return the problem to solve, of the same shapes; by default the given one.
 
-        Apply learnt changes of the problem itself, such as of epsilon, here: every gradient and the
-        plan then depend on them.
+        Apply learnt changes of the problem itself, such as of epsilon, here: then every gradient
+        and the plan depend on them.
         """
         return problem
 
@@ -165,22 +165,21 @@ LONGEST = (8.0, 2.0, 0.5)
 COOLING = 1.5
 """Factor between temperatures of Newton's step."""
 FAR = 3.0
-"""Largest error of a column's logarithmic mass at the temperature that Newton's step starts at."""
+"""Largest error of a column's log mass at the temperature that Newton's step starts at."""
 HOTTEST = 1e12
-"""Where the search for a temperature ends, for scores that are not finite."""
+"""Temperature at which the search for one ends, for scores that are not finite."""
 
 
 @STEPS.register("newton")
 class NewtonStep(Step):
-    """Newton's method on the semi-dual, a concave function of the column potentials alone.
+    """Newton's method on the semi-dual, a concave function of only the column potentials.
 
     The rows' marginals are always met (Brauer et al., 2017), and the Hessian is a weighted graph
-    Laplacian between columns. Of Newton's change of the potentials, clipped to several lengths, and
-    Sinkhorn's the one with the largest semi-dual is taken, which therefore never falls.
+    Laplacian between columns. Of Sinkhorn's change of the potentials and Newton's, clipped to
+    several lengths, the step takes the one with the largest semi-dual, which therefore never falls.
 
-    Where scores are too sharp to begin with, epsilon is first a multiple of the problem's, the
-    temperature, which falls to 1 as the errors do. The step's state is the next temperature.
-    Problems must be balanced.
+    If scores are too sharp to begin with, epsilon is first multiplied by a temperature, which falls
+    to 1 as the errors do. The step's state is the next temperature. Problems must be balanced.
     """
 
     entropic: ClassVar[bool] = True
@@ -220,12 +219,12 @@ def _newton_change(problem: Problem, plan: Array, shares: Array, log_masses: Arr
     """Compute Newton's change of the columns' potentials."""
     gradient = jnp.exp(problem.log_nu) - jnp.exp(log_masses)
     newton = solve_columns(plan, shares, gradient)
-    # A constant changes no plan. The median's, for a few columns may have very far to go.
+    # A constant does not change the plan. Take the median: a few columns may have far to go.
     return newton - jnp.median(newton, axis=-1, keepdims=True)
 
 
 def _best_change(problem: Problem, shares: Array, newton: Array, sinkhorn: Array) -> Array:
-    """Return the change with the largest semi-dual, of Newton's at several lengths and Sinkhorn's.
+    """Return the change with the largest semi-dual: Newton's, at several lengths, or Sinkhorn's.
 
     Changes are clipped entry by entry, so that far columns do not hold up the others.
     """
@@ -233,9 +232,9 @@ def _best_change(problem: Problem, shares: Array, newton: Array, sinkhorn: Array
     tries = jnp.stack([*clipped, jnp.clip(sinkhorn, -LONGEST[0], LONGEST[0])], axis=-1)
     weights = jax.nn.softmax(problem.log_nu)[..., None]
     tries = tries - (weights * tries).sum(axis=-2, keepdims=True)
-    # The semi-dual's gain, from the plan at hand: no new exponentials of matrices.
+    # The semi-dual's gain, from the current plan, without new exponentials of matrices.
     mixed = product("...nk,...kt->...nt", shares, jnp.expm1(tries))
-    least = math.expm1(-2 * LONGEST[0])  # but for rounding
+    least = math.expm1(-2 * LONGEST[0])  # up to rounding
     gains = product("...k,...kt->...t", jnp.exp(problem.log_nu), tries) - product(
         "...n,...nt->...t", jnp.exp(problem.log_mu), jnp.log1p(jnp.maximum(mixed, least))
     )
@@ -244,9 +243,9 @@ def _best_change(problem: Problem, shares: Array, newton: Array, sinkhorn: Array
 
 
 def _cooled(temperature: Array, newton: Array, error: Array) -> Array:
-    """Lower the temperature where the plan is near the one that it solves for."""
+    """Lower the temperature if the plan is near the solution at this temperature."""
     short = jnp.abs(newton).max(axis=-1) <= LONGEST[1]
-    # Errors hardly fall by themselves later, when columns share no rows any more.
+    # Later, when columns no longer share rows, errors hardly fall by themselves.
     near = (error <= 0.03) | ((error <= 1) & short)
     return jnp.where(near, jnp.maximum(temperature / COOLING, 1), temperature)
 
@@ -276,9 +275,9 @@ class DualSoftmaxStep(Step):
 
 
 def _temperature(problem: Problem, column: Array, current: Array, is_first: Array) -> Array:
-    """Return the current temperature; before the first step find one.
+    """Return the current temperature; find one before the first step.
 
-    It is the least, of powers of `COOLING`, that leaves errors of `FAR` at most.
+    It is the least power of `COOLING` that leaves errors of at most `FAR`.
     """
     problem, column = jax.lax.stop_gradient((problem, column))
 
@@ -295,7 +294,7 @@ def _temperature(problem: Problem, column: Array, current: Array, is_first: Arra
 
 
 def check_balanced(problem: Problem, name: str) -> None:
-    """Check that a problem has no relaxed marginals, for a step of balanced problems."""
+    """Check that a problem has no relaxed marginals, for a step that needs balanced problems."""
     require(
         problem.balanced,
         f"step {name}: found relaxed marginals, expected row_tau 1 and column_tau 1: it is for "
@@ -321,7 +320,7 @@ def _scaled(problem: Problem, column: Array, temperature: Array) -> Array:
 
 
 def _marginal_error(problem: Problem, potentials: Potentials) -> Float[Array, "*batch"]:
-    """Return the largest difference of the logarithms of a column's mass and of its marginal."""
+    """Return the largest difference between the logarithms of a column's mass and marginal."""
     masses = problem.lse_rows(potentials.row) + potentials.column
     return jnp.abs(masses - problem.log_nu).max(axis=-1)
 
@@ -336,15 +335,15 @@ def solve_columns(
     """Solve the columns' part of the linearised optimality conditions.
 
     The matrix is diag(masses / column_tau) - row_tau * shares^T plan. It is written as a Laplacian,
-    which avoids cancellation. Where both sides are balanced the heaviest column's unknown is
-    0: one without mass could not carry the others.
+    which avoids cancellation. If both sides are balanced, the unknown of the heaviest column is 0:
+    a column without mass could not hold the others.
 
     Args:
         plan: masses.
         shares: each row's masses divided by their sum.
         target: the right-hand side.
-        row_tau: that of a `Problem`.
-        column_tau: that of a `Problem`.
+        row_tau: see `Problem`.
+        column_tau: see `Problem`.
     """
     # The floor handles columns so far from all rows that their masses are 0.
     masses = jnp.maximum(plan.sum(axis=-2), jnp.finfo(plan.dtype).tiny ** 0.5)

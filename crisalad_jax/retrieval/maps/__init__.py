@@ -1,1 +1,1 @@
-"""Maps: descriptors of images that are kept, appended to and searched."""
+"""Maps: stored image descriptors that you can append to and search."""

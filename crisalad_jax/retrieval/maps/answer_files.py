@@ -1,6 +1,6 @@
-"""Files of a map's answers: JSON, and the tables and layers that maps of other programs read.
+"""Files of a map's answers: JSON, and tables and layers for mapping programs.
 
-GeoJSON is RFC 7946, GPX version 1.1 of Topografix's schema, KML version 2.2 of OGC 07-147r2.
+GeoJSON follows RFC 7946, GPX version 1.1 of Topografix's schema, KML version 2.2 of OGC 07-147r2.
 """
 
 import csv
@@ -25,29 +25,29 @@ from crisalad_jax.utils.output import printable
 POSITION_SUFFIXES = (".csv", ".geojson", ".gpx", ".kml")
 """Suffixes of files that have positions."""
 _DECIMALS = 9
-"""Of degrees: a tenth of a millimetre."""
+"""Decimal places of degrees: a tenth of a millimetre."""
 
 
 class _Place(NamedTuple):
-    """A query, and what its best answer says of it."""
+    """A query and its best answer."""
 
     query: str
     position: tuple[float, float] | None
-    """Of the best answer; None where that has none, or is not similar enough."""
+    """Position of the best answer; None if it has none or is not similar enough."""
     time: str | float | None
-    """UTC, as ISO 8601; or seconds into a video; None where the name says none."""
+    """UTC, as ISO 8601; or seconds into a video; None if the name has no time."""
     known: bool
     answer: dict[str, Any]
-    """The best answer's name, its similarity, and what else is known of it."""
+    """The best answer's name, its similarity and, with a filter, its probability."""
 
 
 def format_answers(path: str | os.PathLike[str], answers: Answers) -> tuple[str, int]:
-    """Put answers into the format that the file's name says.
+    """Format answers according to the file's suffix.
 
-    JSON has all answers: a line for each query (.jsonl, or any other suffix) or a list of them
-    (.json). The others have the best answer's position: .csv in the map's axes, for `--positions`;
-    .geojson, .gpx and .kml in degrees. GPX is a track where all names say seconds since 1970. A
-    query of an unknown place, or whose answer has no position, is without geometry in GeoJSON, and
+    JSON holds all answers: one line per query (.jsonl, or any other suffix) or a list (.json). The
+    other formats hold the best answer's position: .csv in the map's axes, for `--positions`;
+    .geojson, .gpx and .kml in degrees. GPX is a track if all names contain seconds since 1970. A
+    query of an unknown place, or whose answer has no position, has no geometry in GeoJSON and is
     left out of CSV, GPX and KML.
 
     Args:
@@ -67,15 +67,15 @@ def format_answers(path: str | os.PathLike[str], answers: Answers) -> tuple[str,
 def check_positions(
     path: str | os.PathLike[str], axes: tuple[str, str] | None, zone: Zone | None
 ) -> None:
-    """Check that a map has positions that a file of its answers can hold.
+    """Check that a map has the positions that an answer file needs.
 
     Args:
         path: the file.
-        axes: the map's.
-        zone: the map's.
+        axes: axes of the map's positions.
+        zone: the map's UTM zone.
 
     Raises:
-        InputError: it has none or, for degrees, metres without a known zone of UTM.
+        InputError: the map has no positions or, for degrees, metres without a known UTM zone.
     """
     suffix = _suffix(path)
     if suffix not in POSITION_SUFFIXES:
@@ -103,7 +103,7 @@ def _json_list(answers: Answers) -> tuple[str, int]:
 
 
 def _table(answers: Answers) -> tuple[str, int]:
-    """Write a table that `read_image_table` reads: the query's name, and where it was taken."""
+    """Write a table for `read_image_table`: each query's name, and where it was taken."""
     rows = []
     for place in _places(answers, degrees=False):
         if place.position is not None:
@@ -169,11 +169,11 @@ _WRITERS: Mapping[str, Callable[[Answers], tuple[str, int]]] = {
     ".gpx": _gpx,
     ".kml": _kml,
 }
-"""What writes a format, by the suffix of its files: the text, and the number of queries in it."""
+"""Writers by file suffix; each returns the text and the number of queries in it."""
 
 
 def _places(answers: Answers, *, degrees: bool = True) -> list[_Place]:
-    """Return what is known of each query, in order, with latitude and longitude or map axes."""
+    """Return each query in order with its best answer, in degrees or in the map's axes."""
     best = [found[0] for _, found in answers.rows()]
     positions = [answer.image.position for answer in best]
     if degrees and answers.axes != AXES[1]:
@@ -195,7 +195,7 @@ def _answer_fields(answer: Answer) -> dict[str, Any]:
 def _to_degrees(
     answers: Answers, positions: list[tuple[float, float] | None]
 ) -> list[tuple[float, float] | None]:
-    """Convert metres of a known zone of UTM to latitude and longitude."""
+    """Convert metres of a known UTM zone to latitude and longitude."""
     there = [number for number, at in enumerate(positions) if at is not None]
     names = [answers.names[number] for number in there]
     metres = np.array([positions[number] for number in there], np.float64).reshape(-1, 2)
@@ -213,13 +213,13 @@ def _time(query: pathlib.Path) -> str | float | None:
 
 
 def _in_degrees(answers: Answers) -> list[tuple[_Place, *tuple[str, ...]]]:
-    """Return the queries with positions, and their latitude and longitude as XML has them."""
+    """Return the queries with positions, and their latitude and longitude as text for XML."""
     known = [place for place in _places(answers) if place.position]
     return [(place, *map(_degrees, place.position or ())) for place in known]
 
 
 def _degrees(value: float) -> str:
-    """Write degrees without an exponent, which GPX's numbers cannot have."""
+    """Format degrees without an exponent, which GPX does not allow."""
     return f"{value:.{_DECIMALS}f}".rstrip("0").rstrip(".")
 
 

@@ -1,9 +1,9 @@
-"""Append to maps and change them: every addition counts as a whole, and so does every change.
+"""Append to maps and change them; every addition and every change is atomic.
 
-An addition is a segment: its descriptors go to the store, then the record of its images appears
-under its name. That single rename commits the addition. A change, which removes, moves and adds
-images, is a record too. A map whose writer is killed at any moment is as it was before the addition
-or change, or after it. docs/maps.md has the format.
+An addition is a segment: its descriptors go to the store, then the record of its images is renamed
+into place. That single rename commits the addition. A change, which removes, moves and adds images,
+is a record too. If the writer is killed at any moment, the map is as it was before or after the
+addition or change. docs/maps.md describes the format.
 """
 
 import contextlib
@@ -39,17 +39,17 @@ from crisalad_jax.utils.shapes import Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 MOST_CHANGED = 10**6
-"""Number of images that one change removes or moves at most, whose record JSON has room for."""
+"""Most images that one change may remove or move, which its JSON record has room for."""
 
 
 class AppendableMap(Map):
-    """A map that this process alone may append to and change; see `open_for_appending`."""
+    """A map that only this process may append to and change; see `open_for_appending`."""
 
     def fitted(self, names: Iterable[str], positions: Positions | None) -> Positions | None:
-        """Return the positions of new images in the map's axes; None where none of them has one.
+        """Return the positions of new images in the map's axes; None if none of them has one.
 
         Raises:
-            InputError: they have no place there, see `Positions.fitted`.
+            InputError: they don't fit the map's axes or zone, see `Positions.fitted`.
         """
         if positions is None:
             return None
@@ -65,20 +65,20 @@ class AppendableMap(Map):
         root: str,
         positions: Positions | None = None,
     ) -> None:
-        """Append images: all of them are there for good once this returns, and none before.
+        """Append images atomically: once this returns, all of them are stored; before, none are.
 
         Args:
-            names: relative to `root`, none of which the map has.
-            sizes: of their files, in bytes.
-            descriptors: unit vectors, or what else `search` takes; stored as the map's type.
+            names: names relative to `root` that are not in the map yet.
+            sizes: sizes of their files, in bytes.
+            descriptors: unit vectors, or what else `search` takes; stored in the map's type.
             root: the folder of these images.
-            positions: where they were taken, as far as that is known; those of another zone of UTM
-                become the map's.
+            positions: where they were taken, as far as known; those of another UTM zone are
+                converted to the map's.
 
         Raises:
-            InputError: a name that is there already or twice, descriptors that are no unit vectors,
-                positions that have no place among the map's, a store that cannot be written to, or
-                a map that is no longer where it was opened.
+            InputError: a name is in the map already or given twice, descriptors are not unit
+                vectors, positions don't fit the map's axes or zone, the store cannot be written to,
+                or the map is no longer where it was opened.
         """
         self._check_there()
         part = NewImages(names, sizes, descriptors, root, self.fitted(names, positions))
@@ -92,20 +92,19 @@ class AppendableMap(Map):
         moved: Positions | None = None,
         added: Iterable[NewImages] = (),
     ) -> None:
-        """Remove, move and append images: all of it counts once this returns, and none before.
+        """Remove, move and append images in one atomic change.
 
-        The images that are left have other numbers then.
+        The images that are left are renumbered.
 
         Args:
-            verb: why. "replace" also removes the images that have the names of those that are
-                added.
-            removed: numbers of images.
-            moved: new positions, by the names of images, as `fitted_anew` returns them.
+            verb: the reason. "replace" also removes images with the names of those that are added.
+            removed: numbers of the images to remove.
+            moved: new positions by image name, as `fitted_anew` returns them.
             added: new images.
 
         Raises:
-            InputError: no image would be left, more than `MOST_CHANGED` of them, or what `append`
-                raises.
+            InputError: no image would be left, more than `MOST_CHANGED` would change, or what
+                `append` raises.
         """
         self._check_there()
         gone = set(removed)
@@ -149,10 +148,10 @@ class AppendableMap(Map):
         self._segments.change(record, parts())
 
     def fitted_anew(self, positions: Positions) -> Positions:
-        """Return new positions of images in the map's axes and zone; in their own if no other has.
+        """Return new positions in the map's axes and zone, or their own if no other image has one.
 
         Raises:
-            InputError: they have no place there, see `Positions.fitted`.
+            InputError: they don't fit the map's axes or zone, see `Positions.fitted`.
         """
         axes, zone = self.axes, self.zone
         if positions.axes != axes and not any(
@@ -176,11 +175,11 @@ class AppendableMap(Map):
 
         Args:
             part: the images.
-            gone: numbers of images that give their names away.
-            taken: other names that new ones may not be.
+            gone: numbers of images that are removed, whose names may be used again.
+            taken: names that may not be used, in addition to those in the map.
 
         Raises:
-            InputError: a name is there twice; or what `_rows` raises.
+            InputError: a name is in the map already or given twice; or what `_rows` raises.
         """
         descriptors = self._rows("descriptors", part.descriptors)
         there = map(self.images.find, part.names)
@@ -204,7 +203,7 @@ class AppendableMap(Map):
         return record, descriptors
 
     def as_stored(self, descriptors: Descriptors) -> Float32[np.ndarray, "n d"]:
-        """Round descriptors as the map stores them; of bits, unit vectors of the signs."""
+        """Round descriptors as the map stores them; for bits, return unit vectors of the signs."""
         rows = self._rows("descriptors", descriptors).astype(self.metadata.row[1], copy=False)
         return sign_vectors(rows) if self.metadata.is_bits else rows.astype(np.float32, copy=False)
 
@@ -213,18 +212,18 @@ class AppendableMap(Map):
 def open_for_appending(
     folder: str | os.PathLike[str], metadata: MapMetadata, components: Pca | None = None
 ) -> Iterator[AppendableMap]:
-    """Open the map with this metadata to append to it, or make it, with its components.
+    """Open the map with this metadata for appending, or create it with these components.
 
     One process at a time may append; others may search meanwhile. A map that a kill left without
-    images is made anew; one that an exception leaves without images is removed. A note tells of
-    descriptors without a record, which are removed.
+    images is created again; one that an exception leaves without images is removed. Descriptors
+    without a record are removed with a warning.
 
     Raises:
-        InputError: another process appends, the map there is another one or has lost a record of
-            images, what `Map.open` raises, or the folder cannot be written to.
+        InputError: another process is appending, the folder holds a different map or one that has
+            lost a record of images, what `Map.open` raises, or the folder cannot be written to.
     """
     folder = pathlib.Path(folder)
-    read_metadata(folder)  # raises where something else is there, before anything is made
+    read_metadata(folder)  # raises if something else is there, before anything is created
     with contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder / SEGMENTS))
         stack.enter_context(lock(folder))

@@ -1,8 +1,8 @@
-"""Approximate search of a map: an index of FAISS made from its descriptors, or that of Milvus.
+"""Approximate search of a map: a FAISS index built from its descriptors, or the index of Milvus.
 
-The index's name holds a digest of the additions that it was built from. One of other additions is
-not used, so that a map that grew never answers from an old index. Building adds what is new to one
-of the first additions.
+The index's name contains a digest of the additions that it was built from. An index of other
+additions is not used, so a map that has grown never answers from an old one. Building extends an
+existing index of the first additions by the new ones.
 """
 
 import hashlib
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
 SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq"))
-"""How a map in files is searched: as `choose_search` chooses; every descriptor is compared; by a
-graph over the descriptors, which are all in memory; or by their signs in memory, and the files rank
-the answers."""
+"""How a map in files is searched: as `choose_search` chooses; by comparing every descriptor; by a
+graph over the descriptors, all in memory; or by their signs in memory, with answers ranked from the
+files."""
 _EXACT_BYTES = 2**26
-"""Largest size of descriptors that `choose_search` has searched exactly: all are read for a query,
-in less than a tenth of a second."""
+"""Largest size of descriptors that `choose_search` searches exactly: a query reads all of them, in
+less than a tenth of a second."""
 _GRAPH_BYTES = 2**30
-"""Largest size of a graph that `choose_search` takes; a larger one takes long to build."""
+"""Largest size of a graph that `choose_search` chooses; a larger one takes long to build."""
 _LINK_BYTES = 272
-"""Size of the links of a descriptor in a graph."""
+"""Size of one descriptor's links in a graph."""
 FOLDER = "approximate"
 NEIGHBOURS, SAMPLE = 10, 100
-"""Recall is measured over the 10 nearest others of so many of the map's images."""
+"""Recall is measured over the 10 nearest other images of each of 100 of the map's images."""
 _CANDIDATES = {"hnsw": (2, 16), "ivf-rabitq": (10, 100), "diskann": (2, 16)}
-"""Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
-similarity are the answer."""
+"""By kind: candidates per neighbour, and the minimum number of candidates; the best of them by
+exact similarity are the answer."""
 _SEARCHED = 10
-"""Of this many descriptors one is left at least where the index is searched."""
+"""The index is searched only if at least one in this many descriptors is left."""
 _SEED = 0
 Additions = Sequence[tuple[int, int, str]]
 """First number, count and SHA-256 of each addition to a map."""
@@ -58,18 +58,18 @@ class Approximate(NamedTuple):
 
     kind: str
     ask: Callable[[Queries, int, int, Removed], Neighbours]
-    """Finds so many candidates among a count, whose numbers are -1 where there are fewer."""
+    """Finds k candidates among `count` descriptors; numbers are -1 where there are fewer."""
     store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
     is_served: bool = False
-    """Whether a server looks for candidates among what is left, however little that is."""
+    """Whether a server searches for candidates among what is left, however little that is."""
 
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
-        """Find the k most similar of `count` descriptors: candidates, ranked exactly.
+        """Find the k most similar of `count` descriptors by ranking candidates exactly.
 
-        Queries with fewer than k candidates are searched exactly, and so are files where less than
-        a tenth is left. What was removed is no candidate; more are looked at in its place.
+        Queries with fewer than k candidates are searched exactly, and so are files of which less
+        than a tenth is left. Removed descriptors are never candidates; others take their place.
 
         Raises:
             InputError: the store is damaged or gone.
@@ -95,10 +95,10 @@ class Approximate(NamedTuple):
 def open_approximate(
     folder: pathlib.Path, segments: Segments, *, verify: bool
 ) -> Approximate | None:
-    """Open the approximate search of the map in `folder`; None where it has none of its images.
+    """Open the approximate search of the map in `folder`; None if it has none of these images.
 
     Raises:
-        InputError: it is damaged, or changed where `verify` asks for that.
+        InputError: it is damaged or, if `verify` is set, has changed.
     """
     if isinstance(segments.store, MilvusStore):
         return _served(segments.store)
@@ -113,16 +113,16 @@ def open_approximate(
 
 
 def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
-    """List each approximate search in a map's folder, and how many images it is of.
+    """List the approximate searches in a map's folder, with the number of images in each.
 
     Raises:
-        InputError: what says so is damaged.
+        InputError: the record of one is damaged.
     """
     return [(path, int(_record(path)["images"])) for path in _indices(folder)]
 
 
 def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
-    """Return the kind of a map's approximate search of fewer or other images; None without any."""
+    """Return the kind of an outdated approximate search, of fewer or other images; else None."""
     found = _indices(folder)
     if not found or _current(folder, additions) is not None:
         return None
@@ -130,10 +130,10 @@ def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
 
 
 def check_search(kind: str, store: str, dtype: str) -> None:
-    """Check that the descriptors in a store can be searched so.
+    """Check that a store supports this kind of search of its descriptors.
 
     Raises:
-        InputError: a kind that the store has not, or an approximate search of bits.
+        InputError: the store does not have this kind, or it is an approximate search of bits.
     """
     choose("search", kind, SEARCHES if store == "files" else dict.fromkeys((*KINDS, "auto")))
     if kind not in ("auto", "exact") and dtype == "bits":
@@ -141,12 +141,12 @@ def check_search(kind: str, store: str, dtype: str) -> None:
 
 
 def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
-    """Choose how descriptors in files are searched by their size and the memory available.
+    """Choose how to search descriptors in files, by their size and the available memory.
 
     Args:
         count: number of descriptors.
-        length: of each.
-        dtype: what they are stored as.
+        length: length of each.
+        dtype: type that they are stored as.
 
     Returns:
         One of `SEARCHES`, and why it was chosen.
@@ -168,17 +168,17 @@ def build_approximate(
     """Build or extend the approximate search of a map; "exact" removes any.
 
     Args:
-        folder: the map's, whose lock is held.
-        kind: of `SEARCHES`, and of what `check_search` takes.
+        folder: the map's folder, whose lock is held.
+        kind: one of `SEARCHES` that `check_search` accepts.
         segments: the map's descriptors.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Raises:
-        InputError: an index of fewer images is damaged; a full disk.
+        InputError: an index of fewer images is damaged, or the disk is full.
     """
     count, store = len(segments), segments.store
     if isinstance(store, MilvusStore):
-        # Before the index is another, as FLAT compares all on the server.
+        # Before the index changes, as FLAT compares all descriptors on the server.
         measure = None if kind == "exact" else _measuring(store, count)
         store.build(kind, count, quiet=quiet)
         built = _served(store)
@@ -210,7 +210,7 @@ def build_approximate(
 def _extended(
     folder: pathlib.Path, kind: str, segments: Segments, *, quiet: bool
 ) -> "Index | None":
-    """Add what is new to the index of a map's first additions; None where it has no fitting one."""
+    """Extend an index of a map's first additions by the new ones; None if no index fits."""
     for length, digest in enumerate(_digests(segments.spans), 1):
         path = folder / FOLDER / f"{kind}-{digest}.index"
         if path.exists():
@@ -230,14 +230,14 @@ def _asking(index: "Index") -> Callable[[Queries, int, int, Removed], Neighbours
 
 
 def _served(store: MilvusStore) -> Approximate | None:
-    """Return the approximate search that Milvus does of a map, whose recall is not known yet."""
+    """Return Milvus' approximate search of a map, whose recall is not known yet."""
     if store.kind == "exact":
         return None
     return Approximate(store.kind, store.ask, store, math.nan, is_served=True)
 
 
 def _measuring(store: Store, count: int) -> Callable[[Approximate], float]:
-    """Find the exact nearest others of some images; return what measures a search against them."""
+    """Find the exact neighbours of some images; return a function that measures recall of them."""
     from crisalad_jax.retrieval.faiss_index import recall_against_exact
 
     places = sample(count, min(SAMPLE, count), _SEED)
@@ -253,7 +253,7 @@ def _measuring(store: Store, count: int) -> Callable[[Approximate], float]:
 
 
 def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Drop each image itself from its neighbours, or the last one where it is not among them."""
+    """Drop each image itself from its neighbours, or the last one if it is not among them."""
     kept = numbers != places[:, None]
     kept[kept.all(axis=1), -1] = False
     return numbers[kept].reshape(len(numbers), -1)

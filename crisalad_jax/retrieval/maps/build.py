@@ -54,7 +54,7 @@ class Indexed(NamedTuple):
     positions: int
     """Number of added images whose position is known."""
     stay: int
-    """Number of given positions of images that the map had already; it keeps its own."""
+    """Number of given positions not used, as the map had these images already."""
     unreadable: list[str]
     """Names of the images that could not be read."""
     unmatched: list[str]
@@ -63,7 +63,7 @@ class Indexed(NamedTuple):
     """Number of images that the map has now."""
     metadata: MapMetadata
     recall: float | None = None
-    """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
+    """Recall of the approximate search, see `Map.build_search`; None if none was requested."""
     removed: int = 0
     """Number of images that were removed from the map, and stay out."""
     near: int = 0
@@ -77,20 +77,20 @@ def _new_images(
 ) -> tuple[dict[str, int], list[pathlib.Path]]:
     """List the images that the map lacks: their sizes by name, and their paths.
 
-    Those that were removed from it are left out, unless their bytes changed or they come `again`.
+    Those that were removed from it are left out, unless their size changed or `again` is set.
 
     Args:
         target: the map.
         source: the images.
-        left_out: bytes of images that were left out of the map before, by name.
-        again: whether images that were removed are taken.
+        left_out: sizes in bytes of images that were left out of the map before, by name.
+        again: whether to include removed images.
 
     Raises:
-        InputError: a name in the map is of another image here.
+        InputError: a name in the map belongs to another image here.
     """
     sizes, new = {}, []
     all_sizes = for_each(size_of, source.paths)
-    # A size of None is of a missing file, which is skipped.
+    # A size of None means a missing file, which is skipped.
     for name, path, size in zip(source.names, source.paths, all_sizes, strict=True):
         known = target.image(name)
         if known is None:
@@ -128,49 +128,49 @@ def index(
     reading: Reading = Reading(),
     cluster: str | None = None,
 ) -> Indexed:
-    """Make a map of a folder of images, or append to it those that it lacks.
+    """Build a map from a folder of images, or append the images that an existing map lacks.
 
     The same call resumes after a kill.
 
     Args:
         model: parameters and configuration, as `load` returns them, or a `Runtime`. Images are
-            resized and computed as the configuration of a new map says, and as those that an
-            existing map has.
+            resized and computed as the configuration says or, for an existing map, as its images
+            were.
         images: the folder, searched with its subfolders; the map names images by their paths in it.
             Or another source of images (docs/how-to/image-sources.md).
         out: the map's folder.
-        weights: the file that the parameters are from, which queries load by default.
-        fps: frames a second taken of a video or log, which is then expected; None is one.
-        topic: the topic of images in a robot log; None is the only one.
+        weights: the file that the parameters come from, which queries load by default.
+        fps: frames per second to take from a video or log, which `images` must then be; None is 1.
+        topic: the image topic of a robot log; None takes the only one.
         position_topic: the topic of positions in a log; see `open_source`.
-        positions: where images were taken, or a table or track of it (`read_track`). None is what
-            `images` says, if that is a table or a robot log; else what @UTM names say; else what
-            the EXIF data of JPEGs says. Names of several zones of UTM give degrees, or metres of
-            the map's zone.
-        every_metres: least distance of an image from the last one of its folder or video that was
-            taken; nearer ones are left out, and those without a position taken. None takes all.
-        novelty: largest cosine similarity of an image to the last one of its folder or video that
-            was taken; more similar ones are left out, so that a robot that stands still does not
-            fill its map. None takes all.
-        store: "files", or "milvus:URI". None is the map's, and of a new map "files".
+        positions: where images were taken, or a table or track of positions (`read_track`). None
+            takes them from `images`, if that is a table or a robot log; else from @UTM names; else
+            from the EXIF data of JPEGs. Names of several UTM zones give degrees, or metres of the
+            map's zone.
+        every_metres: minimum distance from the last selected image of the same folder or video;
+            nearer images are left out, those without a position are not. None takes all.
+        novelty: maximum cosine similarity to the last selected image of the same folder or video;
+            more similar images are left out, so that a robot that stands still does not fill its
+            map. None takes all.
+        store: "files", or "milvus:URI". None is the existing map's, or "files" for a new map.
         dtype: type of the stored descriptors; "bits" stores their signs (`pack_bits`), which are
-            searched by the Hamming distance. None is the map's, and of a new map "float32".
-        pca: components that shorten the descriptors, or a file of them, of which the map stores a
-            copy. None is the map's, and of a new map none.
-        search: the approximate search that is built from the map's descriptors, or extended by new
-            ones, see `Map.build_search`; "exact" removes one. None leaves what there is, which is
-            of no use once the map has grown.
-        again: whether to add images that were removed from the map, too (`remove_images`).
+            searched by Hamming distance. None is the existing map's, or "float32" for a new map.
+        pca: components that shorten the descriptors, or a file of them; the map stores a copy. None
+            is the existing map's, or none for a new map.
+        search: the approximate search to build from the map's descriptors, or to extend by new
+            ones, see `Map.build_search`; "exact" removes one. None leaves an existing one
+            unchanged, which is not used once the map has grown.
+        again: whether to add images, too, that were removed from the map (`remove_images`).
         reading: how images are read.
-        cluster: the Ray cluster that describes them, as `extract` takes it; None describes here.
+        cluster: the Ray cluster that describes the images, as in `extract`; None is this process.
 
     Returns:
-        What became of the images.
+        Counts and names of the images, by what was done with them.
 
     Raises:
         InputError: parameters of another configuration; no image, or none that can be read;
-            positions of none of them; a distance or similarity out of range; a map of another model
-            or of other settings; what `AppendableMap.append`, `new_metadata` and
+            positions that match none of them; a distance or similarity out of range; a map of
+            another model or of other settings; what `AppendableMap.append`, `new_metadata` and
             `open_for_appending` raise.
 
     Example:
@@ -191,7 +191,7 @@ def index(
     out = pathlib.Path(out)
     metadata = read_metadata(out)
     if positions is not None and position_topic is None:
-        position_topic = "none"  # those of a log would not be used
+        position_topic = "none"  # a log's positions would not be used
     how = {"fps": fps, "topic": topic, "position_topic": position_topic}
     (source,) = open_sources(images, **how, on_bad_image=reading.on_bad_image)
     table = source.positions if positions is None else positions
@@ -263,24 +263,24 @@ def _append(
     *,
     again: bool,
 ) -> list[str]:
-    """Describe images as the map's are, and append them, `SEGMENT` at a time.
+    """Describe images the way the map's were, and append them, `SEGMENT` at a time.
 
     Images whose names the map has are left out, so that the same call resumes after a kill.
 
     Args:
         target: the map.
         source: the images.
-        positions: where they were taken; None is what the images' EXIF data says.
+        positions: where they were taken; None reads the images' EXIF data.
         describing: the model, and how images are read.
-        cluster: as of `index`, and so are the others.
-        novelty: largest similarity to the last image that was taken.
-        again: whether images that were removed are taken.
+        cluster: as in `index`, like the rest.
+        novelty: maximum similarity to the last selected image.
+        again: whether to include removed images.
 
     Returns:
         The names of the images that cannot be read.
 
     Raises:
-        InputError: an image cannot be read; a name in a map is of another image here; or what
+        InputError: an image cannot be read; a name in a map belongs to another image here; or what
             `AppendableMap.append` raises.
     """
     root, total = whole_name(source.root), len(source.paths)

@@ -1,4 +1,4 @@
-"""A map's calibration: from which similarity, or how many inliers, its answers count."""
+"""A map's calibration: the similarity, or number of inliers, from which its answers count."""
 
 import dataclasses
 import pathlib
@@ -11,9 +11,9 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 
 CALIBRATION = "calibration.json"
-"""Name of the file, beside the map's description."""
+"""Name of the file, next to the map's description."""
 VERIFIED = "calibration-verified.json"
-"""The same for answers that are verified, which count by their inliers."""
+"""The same for verified answers, which count by their inliers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,11 +21,11 @@ class Calibration:
     """The contents of either file: an operating point, and what it was measured on."""
 
     min_similarity: float
-    """A query to which no image of the map is that similar shows no place of the map."""
+    """A query is of an unknown place if no image of the map is this similar to it."""
     precision: float
     """The precision that was asked for, as a fraction."""
     answered: int
-    """Number of queries that were answered, of which `right` rightly."""
+    """Number of queries that were answered, of which `right` correctly."""
     right: int
     queries: int
     """Number of all queries of the set."""
@@ -37,15 +37,15 @@ class Calibration:
     benchmark: str
     """Name of the evaluation set."""
     rule: str
-    """What counted as right."""
+    """What counted as correct."""
     model: str
     """The `model_hash` of the map, and so of the descriptors that were compared."""
     created: str = ""
     min_inliers: int = 0
-    """A query whose best answer has fewer inliers shows no place of the map; of verified answers,
-    whose similarity may then be any."""
+    """For verified answers: a query whose best answer has fewer inliers is of an unknown place;
+    similarity is then not limited."""
     verifier: str = ""
-    """The matcher that found the inliers; empty where answers were not verified."""
+    """The matcher that found the inliers; empty if answers were not verified."""
     format: Literal[1] = 1
     """Version of the file."""
 
@@ -57,12 +57,12 @@ class Calibration:
 def read_calibration(
     folder: pathlib.Path, model: str, name: str = CALIBRATION
 ) -> Calibration | None:
-    """Read what the map in `folder` remembers; None where it was never calibrated.
+    """Read the calibration of the map in `folder`; None if it was never calibrated.
 
     Args:
-        folder: the map's.
+        folder: the map's folder.
         model: the map's `model_hash`.
-        name: of the file, `CALIBRATION` or `VERIFIED`.
+        name: name of the file, `CALIBRATION` or `VERIFIED`.
 
     Raises:
         InputError: the file is damaged, of another format, or of another model than the map's.
@@ -87,7 +87,7 @@ def read_calibration(
 
 
 def write_calibration(folder: pathlib.Path, calibration: Calibration) -> None:
-    """Write what the map in `folder` is to remember, in place of what it did.
+    """Replace the stored calibration of the map in `folder`.
 
     Raises:
         InputError: the folder cannot be written to.

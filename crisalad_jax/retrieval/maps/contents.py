@@ -1,4 +1,4 @@
-"""What is in a map: its folders and videos, its additions, and where its images were taken."""
+"""Contents of a map: its folders and videos, its additions, and where its images were taken."""
 
 import collections
 import datetime
@@ -22,7 +22,7 @@ class MapAddition(NamedTuple):
     """Images that were appended to a map from one folder on one day."""
 
     day: str | None
-    """The day, as YYYY-MM-DD in UTC; None where its record says none."""
+    """The day, as YYYY-MM-DD in UTC; None if its record has none."""
     root: str
     """The folder that their names are relative to."""
     images: int
@@ -30,7 +30,7 @@ class MapAddition(NamedTuple):
 
 
 def additions_of(images: "Images") -> list[MapAddition]:
-    """Join the parts of a map's images to additions of a day and root."""
+    """Group the parts of a map's images into additions by day and root."""
     counts = np.diff(images.starts).tolist()
     days = ((part.added and part.added[:10], part.root) for part in images.parts)
     return [
@@ -42,16 +42,16 @@ def additions_of(images: "Images") -> list[MapAddition]:
 
 
 def contents(places: "Map", chosen: "Sequence[MapImage] | None" = None) -> dict[str, Any]:
-    """List what is in a map as JSON values by name.
+    """List the contents of a map as JSON values by name.
 
     Args:
         places: the map.
-        chosen: some of its images, of which the folders and the extent are then; None is all.
+        chosen: images to which the folders and the extent are limited; None is all.
 
     Returns:
-        `folders`: each folder below a root, or video, with its number of images and, where all of
-        their names say times, the first and the last (in seconds of a video, else in UTC);
-        `additions`; `extent`: the smallest and the largest of each axis of the positions, or None.
+        `folders`: each folder below a root, or video, with its number of images and, if all of
+        their names contain times, the first and the last (in seconds of a video, else in UTC);
+        `additions`; `extent`: the minimum and maximum position on each axis, or None.
     """
     folders: dict[str, list[Moment | None]] = collections.defaultdict(list)
     images = places.images if chosen is None else chosen

@@ -1,4 +1,4 @@
-"""Correct maps: remove, replace and move images, and merge maps, each by one change."""
+"""Correct maps: remove, replace and move images, and merge maps, each in one change."""
 
 import collections
 import contextlib
@@ -46,19 +46,19 @@ if TYPE_CHECKING:
     from crisalad_jax.nn.model import Model
 
 _SAME = 0.99
-"""Least similarity of two descriptors of one picture: batches, float16 and bits round them."""
+"""Minimum similarity of two descriptors of one picture: batches, float16 and bits round them."""
 _NEAR = 10_000
-"""Number of names that are searched for one like a name that is not there."""
+"""Number of names that are searched for one similar to a missing name."""
 
 
 @brief
 class MapChange(NamedTuple):
-    """What became of a map's images."""
+    """The result of a change to a map."""
 
     names: list[str]
     """Names of the images that were removed, replaced, moved or merged into the map."""
     there: int
-    """Number of images that needed nothing: removed before, unchanged, or in the map already."""
+    """Number of images that needed no change: removed before, unchanged, or in the map already."""
     images: int
     """Number of images that the map has now."""
     unmatched: Sequence[str] = ()
@@ -68,19 +68,19 @@ class MapChange(NamedTuple):
     stay_out: int = 0
     """Number of images that were removed from the map before, and are not merged into it."""
     stale_search: str | None = None
-    """Kind of an approximate search that lacks images now, and is not used."""
+    """Kind of an approximate search that now lacks images and is not used."""
 
 
 def find_images(
     places: Map, patterns: Sequence[str], addition: int | None = None, day: str | None = None
 ) -> tuple[list[int], int]:
-    """Find images by name, or pattern, among those of an addition or a day.
+    """Find images by name or pattern, among all or those of an addition or a day.
 
     Returns:
-        Their numbers in order, and how many images that were removed before were meant.
+        Their numbers in order, and how many of the named images had been removed before.
 
     Raises:
-        InputError: no such addition or day, or a name or pattern of no image.
+        InputError: no such addition or day, or a name or pattern that matches no image.
     """
     additions = places.additions
     ends = [0, *itertools.accumulate(each.images for each in additions)]
@@ -123,14 +123,14 @@ def remove_images(
     addition: int | None = None,
     day: str | None = None,
 ) -> MapChange:
-    """Remove images from a map; their descriptors stay in its files, and are no longer found.
+    """Remove images from a map; their descriptors stay in its files but are no longer found.
 
-    `index` does not bring them back, unless their files get other bytes or it is asked to.
+    `index` does not add them again, unless their file sizes change or `again` is set.
 
     Args:
-        folder: the map's.
-        names: of images, or patterns such as "monday/*", where * is any letters, ? is one, and
-            [ab] is a or b.
+        folder: the map's folder.
+        names: names of images, or patterns such as "monday/*", where * matches any characters, ?
+            matches one, and [ab] matches a or b.
         addition: only images of this addition, counted from 1 in `Map.additions`.
         day: only images that were added on this day, as YYYY-MM-DD.
 
@@ -138,8 +138,8 @@ def remove_images(
         What was removed.
 
     Raises:
-        InputError: nothing is named; a name, pattern, addition or day of no image; all images; or
-            what `open_for_appending` raises.
+        InputError: nothing is named; a name, pattern, addition or day that matches no image; no
+            image would be left; or what `open_for_appending` raises.
 
     Example:
         >>> import jax
@@ -171,24 +171,24 @@ def replace_images(
     fps: float | None = None,
     reading: Reading = Reading(),
 ) -> MapChange:
-    """Describe again the images of a map whose files have changed, all by one change.
+    """Re-describe the images of a map whose files have changed, all in one change.
 
-    A file has changed that has another size, or was written since the image was described. The
+    A file has changed if its size differs, or if it was written after the image was described. The
     images keep their positions, and become the last ones of the map.
 
     Args:
         model: the model that made the map.
-        images: where the files are, as `index` takes it.
-        folder: the map's.
-        weights: the file that the parameters are from, for messages.
-        fps: frames a second taken of videos.
+        images: where the files are, as in `index`.
+        folder: the map's folder.
+        weights: the file that the parameters come from, for messages.
+        fps: frames per second to take from videos.
         reading: how images are read.
 
     Returns:
         What was replaced; `unmatched` are images that the map does not have.
 
     Raises:
-        InputError: another model; no image of the map's names; an image that cannot be read, or
+        InputError: another model; no image with a name in the map; an image that cannot be read, or
             none that can; or what `open_for_appending` raises.
 
     Example:
@@ -257,19 +257,19 @@ def move_images(
 ) -> MapChange:
     """Give images of a map new positions, such as poses after SLAM.
 
-    Positions come into the map's axes and zone. They may have others where no other image of the
-    map has a position.
+    Positions are converted to the map's axes and zone. They may have others if no other image of
+    the map has a position.
 
     Args:
-        folder: the map's.
-        positions: by name, or a table or track of it, as `index` takes them.
+        folder: the map's folder.
+        positions: positions by name, or a table or track of them, as in `index`.
 
     Returns:
         What was moved.
 
     Raises:
-        InputError: positions of none of the images, or that have no place in the map; or what
-            `open_for_appending` raises.
+        InputError: positions that match none of the images, or don't fit the map's axes or zone; or
+            what `open_for_appending` raises.
 
     Example:
         >>> import jax
@@ -306,25 +306,25 @@ def merge_maps(
     store: str | None = None,
     quiet: bool = True,
 ) -> MapChange:
-    """Append the images of other maps, of the same model and settings, to a map, or make it.
+    """Merge maps of the same model and settings into a map, which is created if it is missing.
 
-    A new map has what is left of the others' images, and none of what was removed. Images keep
-    their folders and days.
+    A new map gets the images that are left in the others, without those that were removed. Images
+    keep their folders and days.
 
     Args:
-        folder: the map's.
-        others: the others'.
-        store: "files", or "milvus:URI", which has float32 of maps in float16, too. None is the
-            map's, and of a new map "files".
-        quiet: no progress bar.
+        folder: the map's folder.
+        others: the folders of the maps whose images are appended.
+        store: "files", or "milvus:URI", which also stores float16 maps as float32. None is the
+            existing map's, or "files" for a new map.
+        quiet: whether to hide the progress bar.
 
     Returns:
         What was appended.
 
     Raises:
-        InputError: maps of several models or settings; a name of two images; positions that have no
-            place in the map; another store than the map's; or what `Map.open` and
-            `open_for_appending` raise.
+        InputError: maps of different models or settings; a name that two images have; positions
+            that don't fit the map's axes or zone; another store than the map's; or what `Map.open`
+            and `open_for_appending` raise.
 
     Example:
         >>> import jax
@@ -376,7 +376,7 @@ def _check_alike(other: Map, metadata: MapMetadata, folder: pathlib.Path) -> Non
     for name, expected in ours.items():
         found = theirs.get(name)
         if found != expected and not (metadata.store != "files" and found == "float16"):
-            most = 12 if name in ("model", "pca") else 60  # of digests as `query` writes them
+            most = 12 if name in ("model", "pca") else 60  # digests are shortened as in `query`
             found, expected = (str(each)[:most] or "none" for each in (found, expected))
             words = f"found a map of {name} {found}, expected {expected} as in {folder}"
             raise InputError(f"{other.folder}: {words}")
@@ -384,7 +384,7 @@ def _check_alike(other: Map, metadata: MapMetadata, folder: pathlib.Path) -> Non
 
 def _merge(target: AppendableMap, others: Sequence[Map], *, quiet: bool) -> MapChange:
     sources = dict[str, Map]()
-    """Of the images that were merged, the maps that they come from."""
+    """The map that each merged image comes from, by name."""
     merged, there, stay_out = list[str](), 0, 0
     total = sum(map(len, others))
     with progress_bar("merging", total, "images", quiet=quiet) as bar:
@@ -413,9 +413,9 @@ def _merge(target: AppendableMap, others: Sequence[Map], *, quiet: bool) -> MapC
 
 
 def _check_same(part: NewImages, other: Map, sources: dict[str, Map], target: Map) -> None:
-    """Check that names that another map has too are of the same image: its size and descriptor.
+    """Check that names that two maps share are of the same image, by its size and descriptor.
 
-    That is the one in `sources`, or else the target.
+    The other map is the one in `sources`, or else the target.
     """
     by_source = collections.defaultdict[Map, list[int]](list)
     for number, name in enumerate(part.names):

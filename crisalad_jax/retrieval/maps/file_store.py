@@ -26,53 +26,53 @@ from crisalad_jax.utils.host import most_files
 from crisalad_jax.utils.shapes import Float, Int64
 
 _BLOCK = 2**23
-"""Largest size of a block of descriptors, and of its products with some queries, in numbers."""
+"""Largest number of elements in a block of descriptors, and in its products with some queries."""
 _MAPPED = 8192
-"""Number of files that stay mapped, at most; Linux allows a process 65,530 mappings. Each takes a
-descriptor, of which these take a sixteenth at most."""
+"""Most files that stay mapped; Linux allows a process 65,530 mappings. Each takes a file
+descriptor, of which these take at most a sixteenth."""
 
 
 class FileStore:
     """A `Store` in a folder of files, each named by the number of its first descriptor.
 
-    Files are memory-mapped one after the other. A search has a few blocks of rows in memory,
-    whatever the size of the map. All rows of a small map, one block, stay in memory.
+    Files are memory-mapped one after the other. A search holds a few blocks of rows in memory,
+    whatever the size of the map. A small map, of one block, stays in memory.
     """
 
     def __init__(self, folder: pathlib.Path, length: int, dtype: str) -> None:
-        """Open a folder of descriptors of `length` numbers; the first `add` makes the folder."""
+        """Open a folder of descriptors of this length; the first `add` creates the folder."""
         self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
         self._counts: dict[int, int] = {}
         """Number of descriptors in each file, by the number of its first, in ascending order."""
         self._held: tuple[int, Removed, Block] | None = None
-        """Of the last search that was of one block: the arguments that it was of, and the block."""
+        """Arguments and block of the last search that read a single block."""
         self._mapped = functools.lru_cache(min(_MAPPED, most_files() // 16))(self._open)
 
     def _path(self, first: int) -> pathlib.Path:
         return self._folder / f"{first:010d}.npy"
 
     def add(self, first: int, descriptors: Descriptors, record: Mapping[str, Any]) -> None:
-        """Write descriptors as numbers `first` and on; they are durable once this returns.
+        """Write descriptors numbered from `first` on; they are durable once this returns.
 
         Args:
             first: number of the first.
-            descriptors: in order.
-            record: of their images, which conditions of a search are about.
+            descriptors: the descriptors, in order.
+            record: the record of their images, which search conditions refer to.
         """
-        del record  # the map's own has it
+        del record  # the map stores it
         path = self._path(first)
         with atomic_path(path, durable=True) as temporary:
             write_npy(temporary, descriptors.astype(self._dtype))
         self._counts[first], self._held = len(descriptors), None
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
-        """Check, without reading them, that all additions, as (first, count), are there."""
+        """Check that all additions, as (first, count), exist, without reading them."""
         for first, count in segments:
             self._counts[first] = count
             self._open(first)
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
-        """Read the descriptors that were added together as numbers `first` and on."""
+        """Read the descriptors that were added together, numbered from `first` on."""
         return np.array(self._open(first))
 
     def _open(self, first: int) -> Descriptors:
@@ -88,11 +88,11 @@ class FileStore:
                 f"{path}: found other bytes than of {self._dtype} {shape}, expected the whole .npy "
                 "file that was written"
             )
-        # Without what a `memmap` does at each indexing.
+        # As a plain array, to avoid what a `memmap` does at each indexing.
         return np.memmap(path, self._dtype, "r", len(header), shape).view(np.ndarray)
 
     def drop(self, first: int) -> None:
-        """Forget what was added from number `first` on, which did not count."""
+        """Delete what was added from number `first` on, which was never committed."""
         for path in self._folder.glob("[0-9]*.npy"):
             if int(path.stem) >= first:
                 path.unlink()
@@ -102,16 +102,16 @@ class FileStore:
     def search(
         self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
     ) -> Neighbours:
-        """Find the k nearest of numbers below `count`, exactly.
+        """Find the k nearest of the first `count` descriptors, exactly.
 
-        They are compared by inner product, packed bits by those that are equal. Of equal
+        They are compared by inner product, packed bits by the number of equal bits. Among equal
         similarities the lower number comes first, also at the k-th place.
 
         Args:
-            queries: as they are compared.
-            k: neighbours of each, from 1 to as many as are left.
-            count: number of descriptors, those that were removed included.
-            removed: which are left out. The others are numbered in its way in the result.
+            queries: unit vectors or packed bits.
+            k: neighbours per query, from 1 to as many as are left.
+            count: number of descriptors, including removed ones.
+            removed: descriptors to leave out; the result numbers the others as it does.
         """
         if self._dtype == BITS:
             parts = (
@@ -124,11 +124,11 @@ class FileStore:
         def files() -> Iterator[Block]:
             for first, places in self._left(count, removed):
                 rows = self._open(first)
-                # A block of small files would keep a descriptor open for each of its parts.
+                # A block of small files would hold a file descriptor open for each of its parts.
                 rows = np.array(rows) if len(rows) < size // 8 else rows
                 yield from blocks(rows, str(self._path(first)), size, places=places)
 
-        if (left := count - len(removed.rows)) <= size:  # a block, which stays for the next search
+        if (left := count - len(removed.rows)) <= size:  # one block, cached for the next search
             if self._held is None or self._held[0] != count or self._held[1] is not removed:
                 (block,) = joined(files(), left)
                 self._held = count, removed, block
@@ -143,18 +143,18 @@ class FileStore:
     def _left(
         self, count: int, removed: Removed
     ) -> Iterator[tuple[int, Int64[np.ndarray, " left"] | None]]:
-        """Yield the files of which rows are left, with the places of these; None is all."""
+        """Yield the files that have rows left, with the places of these rows; None is all."""
         for first, rows in list(self._counts.items()):
             places = removed.left(first, rows)
             if first < count and (places is None or len(places)):
                 yield first, places
 
     def rows(self, numbers: Int64[np.ndarray, " n"], *, release: bool = False) -> Descriptors:
-        """Read the descriptors of these numbers; their files stay mapped into memory.
+        """Read the descriptors with these numbers; their files stay mapped into memory.
 
         Args:
-            numbers: of descriptors, in any order.
-            release: whether to release the pages that are read; numbers are then in order.
+            numbers: numbers of descriptors, in any order.
+            release: whether to release the pages that are read; numbers must then be in order.
 
         Raises:
             InputError: a file is damaged or gone.
@@ -169,5 +169,5 @@ class FileStore:
         return rows
 
     def close(self) -> None:
-        """Let go of files."""
+        """Release the mapped files."""
         self._mapped.cache_clear()

@@ -1,4 +1,4 @@
-"""The images of a map as columns: 48 bytes and its name for each, however many there are."""
+"""The images of a map, stored as columns: 48 bytes and a name for each, at any map size."""
 
 import copy
 import functools
@@ -18,11 +18,11 @@ from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.utils.shapes import Bool, Float64, Int64
 
 _BLOCK = 4096
-"""Number of images that are made at a time while all are read."""
+"""Number of images that are created at a time when iterating over all."""
 _NAMES = "utf-8", "surrogatepass"
-"""Encoding of names; those of files that are not UTF-8 have surrogates."""
+"""Encoding of names; file names that are not UTF-8 have surrogates."""
 _RECENT = 4096
-"""Number of names that are found by a dictionary, at least, before they are sorted too."""
+"""Minimum number of names that are looked up in a dictionary before they are sorted too."""
 
 
 @brief
@@ -32,7 +32,7 @@ class MapImage(NamedTuple):
     name: str
     """Its posix path relative to `root`; no two images of a map share one."""
     bytes: int
-    """Size of the described file in bytes; a file of another size is another picture."""
+    """Size of the described file in bytes; a file of another size counts as another picture."""
     position: tuple[float, float] | None
     root: str
 
@@ -48,20 +48,20 @@ class NewImages(NamedTuple):
     added: str | None = None
     """The time when they were described; None is now."""
     source: object = None
-    """What messages call them; None is their root."""
+    """Their name in messages; None is their root."""
 
     def only(self, chosen: Sequence[bool]) -> "NewImages":
-        """Return those of the images that are chosen."""
+        """Return only the chosen images."""
         names, sizes = (list(itertools.compress(x, chosen)) for x in (self.names, self.sizes))
         rows = self.descriptors[np.array(chosen)]
         return self._replace(names=names, sizes=sizes, descriptors=rows)
 
 
 class Part(NamedTuple):
-    """What images that were appended together share."""
+    """Properties that images appended together share."""
 
     added: str | None
-    """The time; None where their record says none."""
+    """The time; None if their record has none."""
     root: str
     first: int
     """Their first row."""
@@ -81,7 +81,7 @@ class _Column:
         return self._room[: self._size]
 
     def extend(self, rows: Any) -> None:
-        """Append rows; a thread that reads meanwhile sees whole ones."""
+        """Append rows; a thread that reads meanwhile sees only complete ones."""
         size = self._size + len(rows)
         if size > len(self._room):
             room = np.empty((size + size // 8, *self._room.shape[1:]), self._room.dtype)
@@ -92,31 +92,31 @@ class _Column:
 
 
 class Images(Sequence[MapImage]):
-    """The images of a map by number; those that were removed have a row, and no number.
+    """The images of a map by number; removed images have a row, but no number.
 
-    A change of the map makes others. Those that answers hold stay as they are.
+    A change to the map creates a new sequence; the one that existing answers hold stays as it is.
     """
 
     def __init__(self) -> None:
-        """Begin without images."""
+        """Start without images."""
         self.removed = NONE
-        """What was removed, by the row of each in the store, which no change alters."""
+        """The removed images, by their rows in the store, which no change alters."""
         self.parts: list[Part] = []
         """In order."""
         self._firsts, self._ends, self._hashes, self._sizes = (_Column(np.int64) for _ in range(4))
         self._names, self._taken = _Column(np.uint8), _Column(np.float64)
         self._positions = _Column(np.float64, 2)
         self.has_moved = False
-        """Whether an image has another position than its record of images says."""
+        """Whether an image's position differs from the one in its record."""
         self._ends.extend([0])
         self._order = np.empty(0, np.int64)
-        """The first rows, by the hashes of their names."""
+        """The first rows, sorted by the hashes of their names."""
         self._recent: dict[str, int] = {}
-        """The other rows by name; the last one of a name that was removed and came again."""
+        """The other rows by name; the last one for a name that was removed and added again."""
 
     @property
     def rows(self) -> int:
-        """Number of rows, those of images that were removed included."""
+        """Number of rows, including those of removed images."""
         return len(self._positions.values)
 
     def __len__(self) -> int:
@@ -144,10 +144,10 @@ class Images(Sequence[MapImage]):
         return f"Images({len(self)})"
 
     def in_rows(self, rows: Int64[np.ndarray, " n"]) -> list[MapImage]:
-        """Return the images in some rows, also those that were removed."""
+        """Return the images in some rows, including removed ones."""
         places = np.searchsorted(self._firsts.values, rows, side="right") - 1
         at = self._positions.values[rows].tolist()
-        spots = [None if first != first else (first, second) for first, second in at]  # of NaN
+        spots = [None if first != first else (first, second) for first, second in at]  # NaN
         roots = [self.parts[place].root for place in places.tolist()]
         sizes = self._sizes.values[rows].tolist()
         return list(map(MapImage, self._named(rows), sizes, spots, roots))
@@ -159,16 +159,16 @@ class Images(Sequence[MapImage]):
 
     @property
     def starts(self) -> list[int]:
-        """Number of the first image of each part, and behind the last."""
+        """Number of the first image of each part, followed by the number of images."""
         return self.removed.numbers_of(np.append(self._firsts.values, self.rows)).tolist()
 
     def part_of(self, number: int) -> Part:
-        """Return the part that an image is of."""
+        """Return the part that an image belongs to."""
         row = self.removed.rows_of(np.array(number))
         return self.parts[int(np.searchsorted(self._firsts.values, row, side="right")) - 1]
 
     def find(self, name: str) -> int | None:
-        """Return the number of the image of this name; None where there is none."""
+        """Return the number of the image with this name; None if there is none."""
         row = self._recent.get(name)
         if row is None:
             order, key = self._order, hash(name)
@@ -198,7 +198,7 @@ class Images(Sequence[MapImage]):
         positions: Sequence[Sequence[float] | None],
         axes: tuple[str, str] | None,
     ) -> None:
-        """Append images, of which each has a name of its own.
+        """Append images with unique names.
 
         Raises:
             ValueError, TypeError, OverflowError: a value is of another type or out of range, or a
@@ -240,7 +240,7 @@ class Images(Sequence[MapImage]):
         self._recent = {}
 
     def twice(self) -> int | None:
-        """Return a row whose image has a name of another image; None where there is none."""
+        """Return a row whose image has the same name as another; None if there is none."""
         self._sort()
         left = self._order[~self._mask(self.removed.rows)[self._order]]
         hashes = self._hashes.values[left]
@@ -262,7 +262,7 @@ class Images(Sequence[MapImage]):
         positions: Sequence[Sequence[float]],
         axes: tuple[str, str] | None,
     ) -> "Images":
-        """Return what is left without the images in some rows, and with others moved.
+        """Return the images without those in some rows, and with others moved.
 
         Raises:
             ValueError, TypeError, OverflowError: rows beyond the last, or as `extend`.
@@ -284,11 +284,11 @@ class Images(Sequence[MapImage]):
         return new
 
     def left_out(self, mask: Bool[np.ndarray, " row"]) -> Removed:
-        """Return the rows that do not count where only those of a mask do."""
+        """Return the rows that are removed or outside a mask."""
         return Removed(np.flatnonzero(~mask | self._mask(self.removed.rows)))
 
     def begin_with(self, prefixes: Iterable[str]) -> Bool[np.ndarray, " row"]:
-        """Return of each row whether its name begins with one of some texts."""
+        """Return for each row whether its name begins with one of the prefixes."""
         data, ends = self._names.values, self._ends.values
         found = np.zeros(self.rows, bool)
         for text in (prefix.encode(*_NAMES) for prefix in prefixes):
@@ -305,13 +305,13 @@ class Images(Sequence[MapImage]):
 
     @property
     def added(self) -> Float64[np.ndarray, " row"]:
-        """When each row was added, in seconds since 1970, NaN where its record says none."""
+        """When each row was added, in seconds since 1970, NaN if its record does not say."""
         times = [part.seconds for part in self.parts]
         return np.repeat(times, np.diff(np.append(self._firsts.values, self.rows)))
 
     @property
     def taken(self) -> Float64[np.ndarray, " row"]:
-        """When each row was taken, in seconds since 1970, NaN where its name does not say so."""
+        """When each row was taken, in seconds since 1970, NaN if its name does not say."""
         known = len(self._taken.values)
         moments = map(moment_of, self._named(np.arange(known, self.rows)))
         self._taken.extend([np.nan if at is None or at.clock else at.seconds for at in moments])
@@ -321,10 +321,11 @@ class Images(Sequence[MapImage]):
 def checked_positions(
     positions: Sequence[Sequence[float] | None], axes: tuple[str, str] | None
 ) -> Float64[np.ndarray, "n 2"]:
-    """Return positions as rows of a table, of NaN where there is none.
+    """Return positions as rows of a table, NaN where there is none.
 
     Raises:
-        ValueError, TypeError, OverflowError: axes that no map has, or no two numbers in range.
+        ValueError, TypeError, OverflowError: axes that no map has, or a position that is not two
+            numbers in range.
     """
     if axes is not None and axes not in AXES:
         raise ValueError(f"found axes {axes}, expected one of {AXES}")

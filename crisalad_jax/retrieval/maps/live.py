@@ -1,4 +1,4 @@
-"""Answers of a map to images as they come, one at a time."""
+"""Query a map with live images, one at a time."""
 
 import pathlib
 import time
@@ -36,11 +36,11 @@ class LiveAnswer(NamedTuple):
     """The answer to one frame."""
 
     answers: Answers
-    """Of this one query."""
+    """The answers to this one query."""
     frame: Frame
-    """Its image, its time, and how many frames were passed over since the answer before."""
+    """Its image, its time, and how many frames were passed over since the previous answer."""
     latency_ms: float
-    """Milliseconds from the frame in hand to the answer."""
+    """Milliseconds from receiving the frame to the answer."""
 
     @property
     def known(self) -> bool:
@@ -76,25 +76,25 @@ def query_live(
     ready: Callable[[], None] = lambda: None,
     check: Callable[[], None] = lambda: None,
 ) -> Iterator[LiveAnswer]:
-    """Answer images as they come: which of a map's are most similar.
+    """Find the images of a map that are most similar to each frame of a live source.
 
-    The programs are compiled before the first frame is taken, for frames of the source's size. What
-    is added to the map or corrected meanwhile counts from the next frame on, unless `sequence` has
+    The programs are compiled before the first frame is taken, for frames of the source's size.
+    Additions and corrections to the map take effect from the next frame on, unless `sequence` has
     begun to follow the camera through the map as it was.
 
     Args:
         places: the map, open.
         source: a `Camera`, a `FolderWatch`, or a `LatestFrame` that another thread fills.
-        model: the model that made the map; None loads it from where it was (`Map.load_model`).
-        k: number of answers to each frame.
-        window: frames that are described together: each with those just answered before it. 1
-            describes each alone, as a map's images are.
+        model: the model that made the map; None loads it from its recorded path (`Map.load_model`).
+        k: number of answers per frame.
+        window: number of frames that are described together: each with those answered just before
+            it. 1 describes each independently, like a map's images.
         min_similarity: see `query`.
-        sequence: see `query`; frames that were passed over count for nothing.
+        sequence: see `query`; frames that were passed over are ignored.
         where: see `query`.
         verify: see `query`.
         ready: called when the first frame can be answered.
-        check: called several times a second; it may raise, to end this.
+        check: called several times a second; it may raise to stop.
 
     Yields:
         The answer to each frame, with its latency.

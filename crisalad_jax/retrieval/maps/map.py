@@ -1,4 +1,4 @@
-"""Maps: a folder of descriptors with a description of itself, opened to search it."""
+"""Maps: self-describing folders of image descriptors that you open to search."""
 
 import bisect
 import contextlib
@@ -68,17 +68,17 @@ class Answer(NamedTuple):
     rank: int
     """Rank from 1, the most similar."""
     similarity: float
-    """Cosine of the two descriptors; of bits 1 - 2 h / d, where h of the d bits differ."""
+    """Cosine of the two descriptors; for bits 1 - 2 h / d, where h of the d bits differ."""
     image: MapImage
     """The image: its name, and where it was taken."""
     probability: float | None = None
     """Probability that the camera is there; None without a filter."""
     verification: Verification | None = None
-    """What local features show; None where the answer was not verified."""
+    """Result of matching local features; None if the answer was not verified."""
 
 
 class Map:
-    """An open map: made by `Map.open` to search it, or by `open_for_appending`.
+    """An open map, returned by `Map.open` for searching or by `open_for_appending`.
 
     Example:
         >>> import jax
@@ -95,7 +95,7 @@ class Map:
     """
 
     def __init__(self, folder: pathlib.Path, metadata: MapMetadata, store: Store) -> None:
-        """Read what the records say of the images, whose descriptors are in a store."""
+        """Read the records of the images, whose descriptors are in a store."""
         self.folder = folder
         self.metadata = metadata
         """The contents of map.json."""
@@ -106,17 +106,17 @@ class Map:
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self.zone: Zone | None = None
-        """Zone of UTM of all positions in metres east and north; None where it is unknown."""
+        """UTM zone of all positions in metres east and north; None where it is unknown."""
         self.calibration: Calibration | None = None
-        """What `calibrate` measured; None where it did not, or the map is open for appending."""
+        """Result of `calibrate`; None if there is none, or the map is open for appending."""
         self.components = read_components(folder, metadata)
         """The components that shorten descriptors, and those of queries; None is none."""
         self._calibrated = False
         self._approximate: Approximate | None = None
         self._left_out = Where(), self.images, 0, Removed()
         self._describer: tuple[object, Describer] | None = None
-        """A model that is known to be the one that made the map, and what describes with it."""
-        me = weakref.proxy(self)  # in a circle it would not close as soon as nothing refers to it
+        """A model that was checked to be the one that made the map, and its describer."""
+        me = weakref.proxy(self)  # a reference cycle would delay closing
         take: Take = lambda record, path: me._take(record, path)  # noqa: E731
         self._segments = Segments(folder / SEGMENTS, store, metadata.row[1], take)
         if (row := self.images.twice()) is not None:
@@ -131,19 +131,19 @@ class Map:
     def open(
         cls, folder: str | os.PathLike[str], *, verify: bool = True, calibrated: bool = True
     ) -> Self:
-        """Open a map to search it as it is now; images appended meanwhile are not seen.
+        """Open a map to search it as it is now; images appended later are not seen.
 
-        A note says so of an approximate search that is not of all images, and is not used.
+        An approximate search of fewer or other images is not used, and a warning says so.
 
         Args:
-            folder: what `index` made.
-            verify: whether to read all descriptors that are in files, as `verify` does; records
+            folder: a folder that `index` made.
+            verify: whether to read and check all descriptors in files, as `verify` does; records
                 are always checked.
-            calibrated: whether to read what `calibrate` measured; a map without it answers every
-                query, also where that file is damaged.
+            calibrated: whether to read the calibration; a map without it answers every query, even
+                if that file is damaged.
 
         Returns:
-            The map. It lets go of its store when it is closed, at the end of a `with`, or when
+            The map. It releases its store when it is closed, at the end of a `with`, or when
             nothing refers to it any more.
 
         Raises:
@@ -207,7 +207,7 @@ class Map:
 
     @functools.cached_property
     def config(self) -> "ModelConfig":
-        """Configuration of the model, at the image size and in the type of the map's images.
+        """Configuration of the model, with the image size and data type of the map's images.
 
         Raises:
             InputError: it is not one that this package knows.
@@ -223,7 +223,7 @@ class Map:
         return False
 
     def refreshed(self) -> Self:
-        """Return the map as it is now: this one or, where it was changed, a new one for its place.
+        """Return the map as it is now: this one or, if it has changed, a new one in its place.
 
         Raises:
             InputError: as `open`.
@@ -237,27 +237,27 @@ class Map:
 
     @property
     def removed(self) -> Removed:
-        """What was removed, by the row of each in the store, which no change alters."""
+        """The removed images, by their rows in the store, which no change alters."""
         return self.images.removed
 
     @property
     def additions(self) -> list[MapAddition]:
-        """What was appended, in order: from which folder, on which day, and how many are left."""
+        """Additions in order, each with its folder, its day, and the number of images left."""
         return additions_of(self.images)
 
     def was_removed(self, name: str, size: int | None = None) -> bool:
-        """Return whether an image of this name, and of this size if that is given, was removed."""
+        """Return whether an image with this name, and this size if given, was removed."""
         sizes = self.images.removed_names.get(name, ())
         is_one = bool(sizes) if size is None else size in sizes
         return is_one and self.images.find(name) is None
 
     def image(self, name: str) -> MapImage | None:
-        """Return what the map knows of the image of this name; None if it has none."""
+        """Return the image with this name; None if the map has none."""
         number = self.images.find(name)
         return None if number is None else self.images[number]
 
     def added(self, name: str) -> str | None:
-        """Return when the image of this name was described; None where its record does not say."""
+        """Return when the image with this name was described; None if its record does not say."""
         return self.images.part_of(self._number(name)).added
 
     def _number(self, name: str) -> int:
@@ -267,7 +267,7 @@ class Map:
         return number
 
     def _take(self, record: Mapping[str, Any], path: pathlib.Path) -> None:
-        """Take the images of a record, or what a record of a change says.
+        """Apply a record: add its images, or make the change that it describes.
 
         Raises:
             InputError: a value is missing or of another type.
@@ -294,22 +294,22 @@ class Map:
     def search(
         self, queries: Queries, k: int, *, exact: bool = False, where: Where | str | None = None
     ) -> Neighbours:
-        """Find the k most similar images of each query, best first; all where there are fewer.
+        """Find the k most similar images for each query, best first; all if there are fewer.
 
-        Search is exact, by inner product, or by equal bits in a map of these; of equal similarities
-        the earlier image stands first.
-        A map with an approximate search finds nearly all of them. Their similarities are exact.
+        Search is exact, by inner product, or by equal bits in a map of bits; among equal
+        similarities the earlier image comes first. A map with an approximate search finds nearly
+        all of them. Their similarities are exact.
 
         Args:
-            queries: unit descriptors, of the map's model, shortened by its `components`. A map of
-                bits takes those of any length, and packed bits.
+            queries: unit descriptors of the map's model, shortened by its `components`. A map of
+                bits also takes vectors of any norm, and packed bits.
             k: neighbours per query.
-            exact: whether to search exactly although the map has an approximate search.
-            where: which images are searched, as `Where.parse` reads it; None is all.
+            exact: whether to search exactly even if the map has an approximate search.
+            where: which images to search, in the syntax of `Where.parse`; None is all.
 
         Raises:
-            InputError: no queries, descriptors that are no unit vectors of the map's length, k
-                below 1; no image that `where` takes, or what `Where.parse` raises; or the store is
+            InputError: no queries, descriptors that are not unit vectors of the map's length, k
+                below 1; no image meets `where`, or what `Where.parse` raises; or the store is
                 damaged or gone.
         """
         check_count("k", k)
@@ -323,7 +323,7 @@ class Map:
         return found._replace(indices=self.removed.numbers_of(out.rows_of(found.indices)))
 
     def left_out(self, where: Where | str) -> Removed:
-        """Return the rows that a search with conditions leaves out, those of the last one at once.
+        """Return the rows that a search with conditions leaves out; the last result is cached.
 
         Raises:
             InputError: no image is left; what `Where.parse` and `Where.left_out` raise.
@@ -341,25 +341,25 @@ class Map:
 
     @property
     def stale_search(self) -> str | None:
-        """Kind of an approximate search that is not used, as it is of fewer or other images."""
+        """Kind of an approximate search of fewer or other images, which is not used; or None."""
         return stale_kind(self.folder, self._segments.spans) if self._approximate is None else None
 
     def shorten(self, descriptors: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n short"]:
-        """Shorten a model's descriptors by the map's `components`; without any they stay."""
+        """Shorten a model's descriptors by the map's `components`; a no-op without any."""
         return descriptors if self.components is None else self.components.apply(descriptors)
 
     def build_search(self, kind: str, *, quiet: bool = True) -> float | None:
-        """Build the map's approximate search from its descriptors, where it is not there yet.
+        """Build the map's approximate search from its descriptors, unless it exists already.
 
         Args:
-            kind: "hnsw" or "ivf-rabitq", of Milvus also "diskann"; "exact" removes what there is;
-                "auto" chooses by the size of the descriptors and the memory available, or by what
-                Milvus' version has, and a note says why.
-            quiet: whether to show no progress bar.
+            kind: "hnsw" or "ivf-rabitq", with Milvus also "diskann"; "exact" removes an existing
+                one; "auto" chooses by the size of the descriptors and the available memory, or by
+                what this version of Milvus supports, and reports why.
+            quiet: whether to hide the progress bar.
 
         Returns:
-            The share of the exact 10 nearest others that are found of 100 of its images; None of
-            an exact search.
+            The recall of the exact 10 nearest other images of 100 of its images; None for an exact
+            search.
 
         Raises:
             InputError: an unknown kind, one that Milvus lacks, or a map of bits.
@@ -383,15 +383,15 @@ class Map:
     ) -> list[Answer]:
         """Find the images of the map that are most similar to one image.
 
-        The first call loads the model that made the map, and compiles it; later ones do neither.
-        `query` asks for many images at once.
+        The first call loads the model that made the map, and compiles it; later calls reuse it.
+        `query` takes many images at once.
 
         Args:
             image: 8-bit RGB, as `read_image` returns it, or grey (height, width) or (height,
                 width, 1), such as ROS's mono8; or its file.
-            k: number of answers; all where the map has fewer.
-            model: the model that made the map; None loads it from where it was.
-            where: which images are searched, as `search` takes it.
+            k: number of answers; all if the map has fewer.
+            model: the model that made the map; None loads it from its recorded path.
+            where: which images to search, as in `search`.
 
         Returns:
             The answers, best first. Positions are in `axes`.
@@ -449,14 +449,14 @@ class Map:
         return Positions(self.axes, of, self.zone) if self.axes and of else None
 
     def descriptors_of(self, names: Iterable[str]) -> Queries:
-        """Read the descriptors of some images; of bits, unit vectors of the signs."""
+        """Read the descriptors of some images; for bits, unit vectors of the signs."""
         numbers = np.fromiter(map(self._number, names), np.int64)
         found = self._segments[self.removed.rows_of(numbers)]
         return sign_vectors(found) if self.metadata.is_bits else found.astype(np.float32)
 
     @property
     def descriptors(self) -> Iterator[Descriptors]:
-        """Descriptors in order, one array for each addition; of bits, unit vectors of the signs."""
+        """Descriptors in order, one array per addition; for bits, unit vectors of the signs."""
         for span, block in zip(self._segments.spans, self._segments.blocks(), strict=True):
             left = self.removed.left(span.first, span.count)
             rows = block if left is None else block[left]
@@ -464,7 +464,7 @@ class Map:
                 yield sign_vectors(rows) if self.metadata.is_bits else rows
 
     def parts(self) -> Iterator[NewImages]:
-        """Yield the images that are left of each addition, to append them to another map."""
+        """Yield the images left of each addition, for appending them to another map."""
         blocks = self.descriptors
         spans = zip(self.images.parts, itertools.pairwise(self.images.starts), strict=True)
         for part, (start, end) in spans:
@@ -481,7 +481,7 @@ class Map:
         """Read all descriptors, and compare them with the digests in the records.
 
         Raises:
-            InputError: one has changed; the message says of which images.
+            InputError: one has changed; the message says in which addition.
         """
         self._segments.verify()
 
@@ -529,15 +529,15 @@ class Map:
     ) -> EngineName | Literal["jax"]:
         """Choose the engine that describes single images fastest, of those that agree with JAX.
 
-        It is ONNX Runtime or OpenVINO where one is installed, computes what JAX does, and JAX has
+        It is ONNX Runtime or OpenVINO if one is installed and computes the same as JAX, and JAX has
         no accelerator. Weights are exported for it the first time.
 
         Args:
-            weights: as of `load_model`, which takes the answer.
+            weights: as in `load_model`, which takes the result as `engine`.
             groupings: the groupings that queries will be described in.
 
         Raises:
-            InputError: there is no such file; or an exported folder that nothing installed reads.
+            InputError: there is no such file, or no installed engine reads an exported folder.
         """
         file = weights_of(self.metadata, self.folder) if weights is None else weights
         any_grouping = set(groupings) != {"single"}
@@ -554,13 +554,13 @@ class Map:
         """Load the model that made the map, or open it in another engine, which needs no JAX.
 
         Args:
-            weights: the file, or an exported folder; None is where it was then.
+            weights: the file, or an exported folder; None is the recorded path.
             engine: "jax", "onnxruntime" or "openvino".
             groupings: the groupings that queries will be described in.
             verify: whether to compare exported files with their checksums.
 
         Returns:
-            The model, at the image size and in the type of the map's images.
+            The model, with the image size and data type of the map's images.
 
         Raises:
             InputError: there is no such file, what `open_runtime` raises, or it is another model.
@@ -571,7 +571,7 @@ class Map:
             from crisalad_jax.nn.model import Model
 
             found = read_weights(file)
-            assert found.digest is not None  # a file of this package says it
+            assert found.digest is not None  # this package's files contain it
             check_model(self.metadata, self.folder, found.digest, file)
             config = with_non_semantic_fields_of(self.config, found.config)
             model = Model(found.params, config)
@@ -585,11 +585,11 @@ class Map:
     def describer(
         self, model: "Model | Runtime | None" = None, groupings: Sequence[str] = ("single",)
     ) -> Describer:
-        """Return what describes queries with the model that made the map.
+        """Return the describer of queries, which uses the model that made the map.
 
         Args:
-            model: the model; None is the last one, or loads it. The map's image size and types
-                are taken in place of those of its configuration.
+            model: the model; None uses the last one, or loads it. The map's image size and types
+                replace those of its configuration.
             groupings: the groupings that queries will be described in.
 
         Raises:

@@ -38,7 +38,7 @@ _PARTS = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MapMetadata:
-    """The contents of map.json; two are equal that describe images alike."""
+    """The contents of map.json; two that describe images in the same way are equal."""
 
     model: str
     """The `model_hash` of the weights that describe its images, and its queries."""
@@ -55,7 +55,7 @@ class MapMetadata:
     grouping: str = "single"
     """Every image is described independently, so that no descriptor depends on neighbours."""
     collection: str = dataclasses.field(default="", compare=False)
-    """Name of Milvus' collection of the descriptors."""
+    """Name of the Milvus collection of the descriptors."""
     created: str = dataclasses.field(default="", compare=False)
     pca: str = ""
     """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
@@ -80,7 +80,7 @@ class MapMetadata:
 
     @property
     def length_words(self) -> str:
-        """Length of a descriptor in words."""
+        """Length of a descriptor as text."""
         return f"{self.descriptor_length} {'bits' if self.is_bits else 'numbers'}"
 
 
@@ -107,9 +107,9 @@ def new_metadata(
     """Make the metadata of a new map in `folder`, whose images this model will describe.
 
     Raises:
-        InputError: the model's descriptors are not unit vectors, or its components make none or are
-            of another length; bits of a length that is not a multiple of 8; what `check_store`
-            raises.
+        InputError: the model's descriptors are not unit vectors, or the components don't produce
+            unit vectors or expect another length; bits of a length that is not a multiple of 8;
+            what `check_store` raises.
     """
     check_store(store, dtype)
     length, _ = shortened(pca, describer, str(weights), unit=dtype != "bits")
@@ -129,13 +129,13 @@ def new_metadata(
 
 
 def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
-    """Read the metadata of the map in `folder`; None where a new map can be made.
+    """Read the metadata of the map in `folder`; None if a new map can be created there.
 
-    A map without images, which a killed process left, counts as none.
+    A map without images, left by a killed process, counts as none.
 
     Raises:
-        InputError: the folder holds other things than a map, or the map is damaged, of another
-            format, or has a link in it.
+        InputError: the folder holds something other than a map, or the map is damaged, of another
+            format, or contains a link.
     """
     folder = pathlib.Path(folder)
     path = folder / METADATA
@@ -152,7 +152,7 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
                 f"{folder}: found {first} and no {METADATA}, expected a map or an empty folder"
             )
         return None
-    # Who edits the metadata removes its checksum. A changed key would be an unknown field.
+    # Users who edit the metadata remove its checksum. A changed key would be an unknown field.
     metadata = from_plain(MapMetadata, read_json(path, "a map", sealed=False), source=str(path))
     return metadata if has_images(folder) else None
 
@@ -172,7 +172,7 @@ def existing_metadata(folder: str | os.PathLike[str]) -> MapMetadata:
 
 
 def read_components(folder: pathlib.Path, metadata: MapMetadata) -> Pca | None:
-    """Read the components of a map; None where it has none.
+    """Read the components of a map; None if it has none.
 
     Raises:
         InputError: the file is gone, damaged, or of other components.
@@ -201,7 +201,7 @@ def check_model(
 ) -> None:
     """Check that a map was made by the model with the hash `digest`.
 
-    A note says where the model is an int8 program of `quantised_from`, which made the map.
+    A warning says if the model is an int8 program of `quantised_from`, which made the map.
 
     Raises:
         InputError: the hashes differ; the message has both.

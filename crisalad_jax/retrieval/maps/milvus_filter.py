@@ -1,6 +1,6 @@
-"""What Milvus stores of an image, and its filters over that.
+"""Scalar fields that Milvus stores for an image, and filters over them.
 
-A filter is of numbers, or of conditions on images as they were added.
+A filter selects images by number, or by conditions on images as they were added.
 """
 
 import os
@@ -19,13 +19,13 @@ from crisalad_jax.retrieval.maps.where import ALWAYS, Where
 from crisalad_jax.utils.shapes import Int64
 
 _RANGES = 16
-"""Ranges in a filter; Milvus 2.3 takes 0.1 s to parse so many, and 2 s for 100."""
+"""Most ranges in a filter; Milvus 2.3 takes 0.1 s to parse 16, and 2 s to parse 100."""
 _NOWHERE = sys.float_info.max
-"""A position or time that is unknown; Milvus before 2.5 has no null."""
+"""Value of an unknown position or time; Milvus before 2.5 has no null."""
 
 
 def columns_of(record: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """Return the scalar fields of a record's images, which conditions are about."""
+    """Return the scalar fields of a record's images, which conditions refer to."""
     names = record["names"]
     added = record.get("added")
     moments = [moment_of(name) for name in names]
@@ -42,7 +42,7 @@ def columns_of(record: Mapping[str, Any]) -> dict[str, list[Any]]:
 
 
 def _encoded(name: str) -> str:
-    """Return a name in ASCII; what begins alike still does."""
+    """Encode a name in ASCII; common prefixes are preserved."""
     return urllib.parse.quote(os.fsencode(name), safe="/#")
 
 
@@ -92,7 +92,7 @@ def among(numbers: Int64[np.ndarray, " n"]) -> str:
 
 
 def _any(parts: Sequence[str]) -> str:
-    """Join alternatives in pairs: Milvus takes long to parse a row of them."""
+    """Join alternatives in pairs: Milvus is slow to parse a long chain of them."""
     if len(parts) == 1:
         return parts[0]
     middle = len(parts) // 2

@@ -1,7 +1,7 @@
-"""Descriptors in Milvus: a server, or milvus-lite in this process, by the same code.
+"""Descriptors in Milvus: on a server, or in milvus-lite in this process, with the same code.
 
-Rows are upserted, so that a call whose acknowledgement was lost can be made again. Milvus has
-written an acknowledged row to its log; searches here are of what was acknowledged before.
+Rows are upserted, so that a call whose acknowledgement was lost can be repeated. Milvus has written
+an acknowledged row to its log; searches here see what was acknowledged before.
 """
 
 import contextlib
@@ -30,23 +30,22 @@ from crisalad_jax.utils.shapes import Float, Int64
 
 TOKEN = "CRISALAD_MILVUS_TOKEN"
 """The environment variable that holds a server's token, or its user:password."""
-# Bytes in a message, at most: Milvus takes 64 MiB by default.
+# Most bytes in a message: Milvus accepts 64 MiB by default.
 _MESSAGE_BYTES = 2**24
 _MOST = 16384
 """Largest number of neighbours, of queries at once, and of returned rows that Milvus allows."""
 _CONNECT = 10.0
 """Seconds to wait for a connection."""
 _GRPC = {"grpc.max_reconnect_backoff_ms": 1000}
-"""Without this a server that is back again is asked after up to two minutes."""
+"""Without this, up to two minutes pass before a server that is back is contacted again."""
 _ANSWER = 120.0
-"""Seconds to wait for an answer, with a server that restarts in between."""
+"""Seconds to wait for an answer, including a restart of the server."""
 _STALLED = 1800.0
-"""Seconds without progress after which an index is no longer waited for: a segment of a GB takes
-some minutes."""
+"""Seconds without progress before giving up on an index: a segment of a GB takes some minutes."""
 _PASSING = (2, 101, 103, 106, 503, 700)
-"""Milvus' codes, of those that it does not call retriable, of a server that is coming back: no
-connection; a collection that is not loaded, or whose index is being made; a channel."""
-# The last one logs a call that milvus-lite lacks, whose failure the client expects.
+"""Milvus' error codes of a server that is coming back, but that it does not call retriable: no
+connection; a collection that is not loaded, or whose index is being built; a channel."""
+# The last one logs a call that milvus-lite lacks and whose failure the client expects.
 _LOGS = ("pymilvus.decorators", "pymilvus.client", "milvus_lite.server_manager", "grpc._server")
 
 
@@ -55,7 +54,7 @@ class _Kind(NamedTuple):
 
     name: str
     since: tuple[int, ...]
-    """The first version that has it, of which milvus-lite's is (0,)."""
+    """The first version that has it; milvus-lite counts as (0,)."""
     build: Mapping[str, Any] = {}
     search: Callable[[int], Mapping[str, Any]] = lambda _: {}
     """Returns parameters of a search for k neighbours."""
@@ -74,24 +73,24 @@ KINDS = {
     ),
     "diskann": _Kind("DISKANN", (2, 2), {}, lambda k: {"search_list": max(128, 2 * k)}),
 }
-"""How Milvus searches: comparing all, in memory; a graph, in memory; codes of a bit and a byte for
-each dimension, in memory; a graph on the disk. Of HNSW the numbers are those of maps in files."""
+"""How Milvus searches: by comparing all, in memory; by a graph, in memory; by codes of a bit and a
+byte per dimension, in memory; by a graph on disk. HNSW has the parameters of maps in files."""
 _FEW, _GRAPH_BYTES = 50_000, 2**34
-"""Largest number of descriptors that are compared one by one, and size of those in a graph."""
+"""Most descriptors that are compared one by one, and largest size of those in a graph."""
 
 
 def choose_kind(count: int, length: int, version: tuple[int, ...]) -> str:
-    """Choose the index of `count` descriptors of this length, of those that Milvus' version has."""
+    """Choose an index of this Milvus version for `count` descriptors of this length."""
     kinds = [kind for kind in ("ivf-rabitq", "diskann") if KINDS[kind].since <= version]
     small = "exact" if count <= _FEW else "hnsw"
     return small if 4 * count * length <= _GRAPH_BYTES or not kinds else kinds[0]
 
 
 def check_address(address: str) -> bool:
-    """Check Milvus' address; return True for an http address, False for a file.
+    """Check a Milvus address; return True for an http address, False for a file.
 
     Raises:
-        InputError: neither, or an address with a user's name.
+        InputError: it is neither, or an address with a user name.
     """
     if address.startswith(("http://", "https://")):
         if "@" in urllib.parse.urlsplit(address).netloc:
@@ -109,10 +108,10 @@ def check_address(address: str) -> bool:
 
 
 class MilvusStore:
-    """A `Store` in a collection of Milvus."""
+    """A `Store` in a Milvus collection."""
 
     def __init__(self, address: str, collection: str, length: int, *, new: bool) -> None:
-        """Connect to `address`, and make the collection if it is `new`."""
+        """Connect to `address`, and create the collection if it is `new`."""
         self._is_file = not check_address(address)
         try:
             import pymilvus
@@ -126,7 +125,7 @@ class MilvusStore:
         self._address, self._collection, self._length = address, collection, length
         self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
         self._since: int | None = None
-        """Milvus' time after the last acknowledged addition; None is not known yet."""
+        """Milvus' time after the last acknowledged addition; None if not known yet."""
         self._loaded = False
         path = pathlib.Path(address)
         if self._is_file and new:
@@ -141,7 +140,7 @@ class MilvusStore:
         numbers = re.findall(r"\d+", self._server)[:3]
         self._version = (0,) if self._is_file else tuple(map(int, numbers))
         self.kind = "exact"
-        """Of `KINDS`."""
+        """One of `KINDS`."""
         if new:
             self._ask("removing what a kill left", "drop_collection")
             self._create()
@@ -152,7 +151,7 @@ class MilvusStore:
         elif found := self._index():
             names = {each.name: kind for kind, each in KINDS.items()}
             self.kind = names[found["index_type"]]
-        else:  # killed while the index was changed
+        else:  # a process was killed while changing the index
             self._make_index()
 
     @contextlib.contextmanager
@@ -173,7 +172,7 @@ class MilvusStore:
             raise InputError(f"{self._address}: Milvus says: {words}") from error
 
     def _ask(self, doing: str, method: str, *, wait: float = 0, **options: Any) -> Any:
-        """Call a method of the client; again where a server is coming back.
+        """Call a method of the client, and retry while a server is coming back.
 
         Raises:
             InputError: Milvus refuses, or does not come back in `_ANSWER` seconds.
@@ -189,7 +188,7 @@ class MilvusStore:
                     return call(self._collection, timeout=wait, **options)
                 except pymilvus.MilvusException as error:
                     end = end or time.monotonic() + _ANSWER
-                    # 2.3 has no code for parts of it that do not find each other yet.
+                    # 2.3 has no code for components that have not found each other yet.
                     passes = error.retriable or "unrecoverable error" in error.message
                     passes |= error.code in _PASSING
                     if not passes or self._is_file or time.monotonic() > end:
@@ -236,25 +235,25 @@ class MilvusStore:
         except InputError:
             if not self._is_file:
                 raise
-            # milvus-lite writes an index in place: one that a kill cut short never loads again. It
-            # can be rebuilt from the descriptors.
+            # milvus-lite writes an index in place: one that a kill interrupted never loads again,
+            # but can be rebuilt from the descriptors.
             self._drop_index()
             self._make_index()
             self._ask("loading descriptors", "load_collection")
         self._loaded = True
 
     def build(self, kind: str, count: int, *, quiet: bool = True) -> None:
-        """Make the index of all descriptors, and of those that are added later.
+        """Build the index of all descriptors, including those that are added later.
 
-        Searches, also of other processes, wait until it is there.
+        Searches, also in other processes, wait until it is ready.
 
         Args:
-            kind: of `KINDS`, or "auto", as `choose_kind` does.
+            kind: one of `KINDS`, or "auto" for `choose_kind`.
             count: number of descriptors.
-            quiet: no progress bar.
+            quiet: whether to hide the progress bar.
 
         Raises:
-            InputError: this server does not have it, or fails.
+            InputError: this server does not have this kind, or fails.
         """
         if kind == "auto":
             kind = choose_kind(count, self._length, self._version)
@@ -308,12 +307,12 @@ class MilvusStore:
             )
 
     def _fetch(self, doing: str, method: str, condition: str, **options: Any) -> Any:
-        """Query or search; all is seen that was acknowledged before the first call."""
+        """Query or search; see everything that was acknowledged before the first call."""
         self._load()
         if self._since is None:
             with self._one_line("asking for its time"):
                 self._since = self._client._get_connection().alloc_timestamp(timeout=_ANSWER)
-        # "Strong" would wait for Milvus' next tick each time, 0.2 s and more.
+        # "Strong" would wait for Milvus' next tick each time, 0.2 s or more.
         options |= {"consistency_level": "Customized", "guarantee_timestamp": self._since}
         return self._ask(doing, method, filter=condition, **options)
 
@@ -322,7 +321,7 @@ class MilvusStore:
         return self.rows(np.arange(first, first + count))
 
     def rows(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
-        """Fetch the descriptors of these numbers; see `FileStore.rows`."""
+        """Fetch the descriptors with these numbers; see `FileStore.rows`."""
         found, ordered = dict[int, Any](), np.sort(numbers)
         for start in range(0, len(ordered), self._rows):
             condition = among(ordered[start : start + self._rows])
@@ -337,14 +336,14 @@ class MilvusStore:
         return np.array([found[number] for number in numbers.tolist()])
 
     def drop(self, first: int) -> None:
-        """Do nothing, as the next addition overwrites them; see `FileStore.drop`."""
+        """Do nothing, as the next addition overwrites the rows; see `FileStore.drop`."""
 
     def search(
         self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
     ) -> Neighbours:
-        """Find the k most similar descriptors of each query; see `FileStore.search`.
+        """Find the k most similar descriptors for each query; see `FileStore.search`.
 
-        Milvus does it with its index FLAT; with others all descriptors are read.
+        Milvus searches its FLAT index; with other indices, all descriptors are read and compared.
         """
         require(k <= _MOST, f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
         if self.kind != "exact":
@@ -365,9 +364,9 @@ class MilvusStore:
         return nearest(stream, queries, k, read, self._rows)
 
     def ask(self, queries: Queries, k: int, count: int, removed: Removed) -> Neighbours:
-        """Search by Milvus' index; where it finds fewer than k, the last numbers are -1."""
+        """Search Milvus' index; if it finds fewer than k, the last numbers are -1."""
         k, condition = min(k, _MOST), left_in(count, removed)
-        # Answers are bounded too: 12 bytes for each neighbour, and 8 for its number again.
+        # Answers are bounded too: 12 bytes per neighbour, and 8 for its number again.
         size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
         indices = np.full((len(queries), k), -1, np.int64)
         similarities = np.full((len(queries), k), -np.inf, np.float32)
@@ -402,14 +401,14 @@ def break_ties(
 ) -> Neighbours:
     """Search so that equal similarities are ordered by number, also at the k-th place.
 
-    One more than k is asked for. Where the last is as similar as the k-th, there may be more equal
-    ones: twice as many are asked for, until the last is less similar.
+    One more than k is requested. If the last is as similar as the k-th, there may be more equal
+    ones: twice as many are requested, until the last is less similar.
 
     Args:
         ask: takes queries and k; returns the k most similar of each, equal ones in any order.
         queries: unit descriptors.
         k: neighbours per query, at most `count`.
-        count: how many descriptors there are.
+        count: number of descriptors.
     """
     asked = k + 1
     while True:

@@ -1,6 +1,6 @@
-"""Keyframes by similarity: images that look like the last one that was taken do not fill a map.
+"""Keyframes by similarity: leave out images that look like the last one that was selected.
 
-What is left out is recorded next to the map's images, so that it is not described again. The
+Left-out images are recorded next to the map's images, so that they are not described again. The
 records only save work: without them the same images are left out.
 """
 
@@ -16,20 +16,20 @@ from crisalad_jax.utils.shapes import Bool, Float32
 from crisalad_jax.utils.temporaries import remove_temporaries
 
 SIMILAR = "similar"
-"""Folder in a map of the records of what was left out."""
+"""Folder in a map with the records of left-out images."""
 
 
 class Novelty:
     """Chooses which images of a source a map takes, in order, as they are described."""
 
     def __init__(self, target: AppendableMap, source: ImageSource, root: str, most: float) -> None:
-        """Read what was left out before.
+        """Read which images were left out before.
 
         Args:
             target: the map, open for appending.
             source: the images.
             root: the folder of these images, as the map names it.
-            most: largest similarity to the last image that was taken.
+            most: maximum similarity to the last selected image.
 
         Raises:
             InputError: a record is damaged.
@@ -38,9 +38,9 @@ class Novelty:
         self._settings = {"root": root, "novelty": most}
         self._order = iter(source.names)
         self._last: dict[object, str | Float32[np.ndarray, " d"]] = {}
-        """Of each sequence, the name or the descriptor of the last image that the map took."""
+        """By sequence, the name or the descriptor of the last image that the map took."""
         self.left_out: dict[str, int] = {}
-        """Bytes of the images that were left out, by name."""
+        """Sizes in bytes of the images that were left out, by name."""
         self._folder = target.folder / SIMILAR
         remove_temporaries(self._folder)
         self._records = sorted(self._folder.glob("[0-9]*.json"))
@@ -52,7 +52,7 @@ class Novelty:
     def choose(
         self, names: Sequence[str], descriptors: Float32[np.ndarray, "n d"]
     ) -> Bool[np.ndarray, " n"]:
-        """Return which of some images, the next ones of the source that are described, are new."""
+        """Return which of the next described images of the source are new."""
         rows = self._map.as_stored(descriptors)
         return np.array([self._is_new(*each) for each in zip(names, rows, strict=True)], bool)
 
@@ -72,7 +72,7 @@ class Novelty:
         return True
 
     def leave_out(self, names: Sequence[str], sizes: Sequence[int]) -> None:
-        """Record images that were left out, with the bytes of their files."""
+        """Record images that were left out, with their sizes in bytes."""
         path = self._folder / f"{len(self._records):010d}.json"
         write_record(path, {**self._settings, "names": list(names), "bytes": list(sizes)})
         self._records.append(path)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # pairs among a map's images need no JAX
     from crisalad_jax.nn.model import Model
 
 _NUMBERS = 2**25
-"""Pairs of a query and an image that are looked at together, one byte each."""
+"""Pairs of a query and an image that are processed together, one byte each."""
 
 _Pair = tuple[str, str]
 
@@ -47,10 +47,10 @@ class ImagePairs(NamedTuple):
     """Names of the images that could not be read, which have no pairs."""
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write a line for each pair: two names, with one space between them.
+        """Write one line per pair: two names, separated by a space.
 
-        COLMAP reads it (`matches_importer --match_type pairs`, `pycolmap.match_image_pairs`), and
-        so does hloc.
+        COLMAP (`matches_importer --match_type pairs`, `pycolmap.match_image_pairs`) and hloc read
+        this file.
 
         Args:
             path: the file.
@@ -78,25 +78,25 @@ def image_pairs(
     fps: float | None = None,
     reading: Reading = Reading(),
 ) -> ImagePairs:
-    """Choose pairs of images to match: all that one of the rules below gives.
+    """Choose pairs of images to match: all that at least one of the rules below gives.
 
-    They are among the images of a map, for a reconstruction, or of other images with those of the
-    map, to localise them. Never is an image paired with itself.
+    Pairs are among the images of a map, for reconstruction, or between other images and those of
+    the map, to localise them. An image is never paired with itself.
 
     Args:
         places: the map, open.
         images: a source of other images (docs/how-to/image-sources.md), which the map's model
             describes; None pairs the map's images with each other.
-        model: that model; None loads it from where it was (`Map.load_model`).
-        k: each image with its k most similar ones; 0 is none of these.
-        min_similarity: least similarity of these.
-        min_gap: these are at least so many seconds apart, by the times in their names: loops. Times
-            in two videos, or by two clocks, are apart.
-        overlap: each image of the map with the next ones of its folder or video, in order.
-        within: images of the map that were taken at most so many metres apart.
-        root: folder that names are relative to; None is that of the images or, of several, the one
-            that holds all.
-        fps: frames a second taken of a video as `images`; None is one.
+        model: that model; None loads it from its recorded path (`Map.load_model`).
+        k: pair each image with its k most similar ones; 0 turns this rule off.
+        min_similarity: minimum similarity of these.
+        min_gap: minimum time in seconds between these, from the times in their names: loops. Times
+            in two videos, or by two clocks, are far enough apart.
+        overlap: pair each image of the map with this many next ones of its folder or video.
+        within: pair images of the map that were taken at most this many metres apart.
+        root: folder that names are relative to; None is that of the images or, if there are
+            several, the one that contains them all.
+        fps: frames per second to take if `images` is a video; None is 1.
         reading: how `images` are read.
 
     Returns:
@@ -156,17 +156,17 @@ def image_pairs(
 def check_rules(
     *, among: bool, k: int, overlap: int, within: float | None, min_gap: float | None
 ) -> None:
-    """Check what can be checked of the rules of `image_pairs` before a model is loaded.
+    """Check the rules of `image_pairs` as far as possible before a model is loaded.
 
     Args:
         among: whether pairs are among the images of one map.
-        k: as `image_pairs` takes it, and so are the others.
+        k: as in `image_pairs`, like the others.
         overlap: the next images.
         within: metres.
         min_gap: seconds.
 
     Raises:
-        InputError: a number out of range, no rule, or one that is for images of one map alone.
+        InputError: a number out of range, no rule, or one that is only for images of one map.
     """
     require(k >= 0, f"k: found {k}, expected at least 0")
     require(overlap >= 0, f"overlap: found {overlap}, expected at least 0")
@@ -188,7 +188,7 @@ def _check_names(names: list[str]) -> None:
     """Check that names fit in a file of pairs, where a space separates them.
 
     Raises:
-        InputError: a name has a space in it, or is no line of its own, or begins as a comment does.
+        InputError: a name is empty, contains whitespace, or begins with #, as comments do.
     """
     wrong = [name for name in names if name.split() != [name] or name.startswith("#")]
     if wrong:
@@ -250,7 +250,7 @@ def _similar(
             mine = _moments(asked, clocks)
             gaps = np.abs(mine[1][:, None] - known[1])
             excluded |= (mine[0][:, None] == known[0]) & (gaps < min_gap)
-        # Among so many the k are, however many of the nearest are left out.
+        # These include the k, however many of the nearest are left out.
         found = places.search(rows, k + int(excluded.sum(axis=1).max()))
         for row, (indices, similarities) in enumerate(zip(*found, strict=True)):
             right = ~excluded[row, indices] & (similarities.astype(np.float64) >= least)
@@ -260,7 +260,7 @@ def _similar(
 def _moments(
     names: list[str], clocks: dict[str, int]
 ) -> tuple[Int64[np.ndarray, " image"], Float64[np.ndarray, " image"]]:
-    """Read when images were taken: the number of each one's clock, and seconds on it."""
+    """Read when images were taken: the number of each image's clock, and the seconds on it."""
     moments = [moment_of(name) for name in names]
     without = [name for name, moment in zip(names, moments, strict=True) if moment is None]
     if without:
@@ -286,10 +286,10 @@ def _consecutive(places: Map, names: list[str], overlap: int) -> Iterator[_Pair]
 
 
 def _nearby(places: Map, names: list[str], within: float | None) -> Iterator[_Pair]:
-    """Yield the images that were taken at most so many metres apart."""
+    """Yield the pairs of images that were taken at most `within` metres apart."""
     if within is None:
         return
-    from scipy.spatial import KDTree  # takes a fifth of a second
+    from scipy.spatial import KDTree  # the import takes 0.2 s
 
     known = [number for number, image in enumerate(places.images) if image.position]
     require(bool(known), f"within: found no positions in {places.folder}, expected some")

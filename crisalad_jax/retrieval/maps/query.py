@@ -1,4 +1,4 @@
-"""Queries to a map: which of its images are most similar to others, and where they were taken."""
+"""Query a map: find its images that are most similar to others, and where they were taken."""
 
 import itertools
 import json
@@ -42,9 +42,9 @@ if TYPE_CHECKING:  # answers are searched without JAX
     from crisalad_jax.nn.model import Model
 
 Thresholds = tuple[float | None, int | None]
-"""The similarity and the inliers that best answers must have; None where any counts."""
+"""Minimum similarity and number of inliers of a best answer; None accepts any."""
 AT_ONCE = 1024
-"""Number of queries that are searched for together: the map is read once for so many."""
+"""Number of queries that are searched for together: the map is read once for all of them."""
 
 
 @brief
@@ -62,24 +62,24 @@ class Answers(NamedTuple):
     unreadable: Sequence[pathlib.Path] = ()
     """Image files that could not be read, which have no answers."""
     min_similarity: float | None = None
-    """The similarity that a best answer must have; None where any counts."""
+    """Minimum similarity of a best answer; None accepts any."""
     probabilities: Float64[np.ndarray, "query k"] | None = None
-    """Probability of each answer that the camera is there; None without a filter."""
+    """Probability that the camera is at each answer; None without a filter."""
     best: Float32[np.ndarray, " query"] | None = None
-    """Similarity of the most similar image of the map, where a filter may have chosen another; None
-    without a filter, where it is the first answer's."""
+    """Similarity of the map's most similar image, which a filter may not have ranked first; None
+    without a filter, as it is the first answer's."""
     zone: Zone | None = None
-    """Zone of UTM of all positions; None where it is unknown."""
+    """UTM zone of all positions; None where it is unknown."""
     root: pathlib.Path | None = None
-    """Folder that names of queries are relative to: of their source or, of several, the one that
-    holds all; None where names are whole paths."""
+    """Folder that names of queries are relative to: that of their source or, if there are several,
+    the one that contains them all; None if names are full paths."""
     checks: Sequence[Sequence[Verification]] | None = None
-    """Verifications of the first answers to each query, in the order of `neighbours`; None where
+    """Verifications of the first answers to each query, in the order of `neighbours`; None if
     answers were not verified."""
     poses: Sequence[MapPose | None] | None = None
-    """Where the camera of each query was, where verified answers say so; None as `checks`."""
+    """Camera pose of each query, if verified answers determine it; None as for `checks`."""
     min_inliers: int | None = None
-    """The inliers that a verified best answer must have; None where any number counts."""
+    """Minimum number of inliers of a verified best answer; None accepts any."""
 
     @property
     def is_thresholded(self) -> bool:
@@ -137,32 +137,32 @@ def query(
     verify: Verify | None = None,
     reading: Reading = Reading(),
 ) -> Answers:
-    """Find the images of a map that are most similar to others.
+    """Find the images of a map that are most similar to the given ones.
 
     Args:
         places: the map, open.
         images: an image file, a folder, another source of images
             (docs/how-to/image-sources.md), or a list of these.
-        model: the model that made the map; None loads it from where it was (`Map.load_model`).
-        k: number of answers to each query.
-        fps: frames a second taken of a video or log, which is then expected; None is one.
-        topic: the topic of images in a robot log; None is the only one.
-        window: frames that are described together: each with those just before it in its source,
-            as a moving camera has them. Files listed one after the other are one source. 1
-            describes each independently, as a map's images are.
-        exact: whether to search exactly although the map has an approximate search.
-        min_similarity: a query to which no image is that similar is of an unknown place; see
-            `Answers.known`. None is what `calibrate` measured, and any where it did not; -1 is any.
-        sequence: a filter over the map's images in their order, where queries are consecutive
-            frames of one camera; None takes every query for itself.
-        where: which images of the map are searched, such as "folder=monday, added>=2026-05-01"
-            (`Where.parse`); None is all, as with `sequence`.
-        verify: how the best answers are verified by local features, and put in order by their
-            inliers (docs/verification.md); None leaves them by similarity.
+        model: the model that made the map; None loads it from its recorded path (`Map.load_model`).
+        k: number of answers per query.
+        fps: frames per second to take from a video or log, which `images` must then be; None is 1.
+        topic: the image topic of a robot log; None takes the only one.
+        window: number of frames that are described together: each with those just before it in its
+            source, as a moving camera sees them. Files listed one after the other are one source. 1
+            describes each independently, like a map's images.
+        exact: whether to search exactly even if the map has an approximate search.
+        min_similarity: a query is of an unknown place if no image is this similar to it; see
+            `Answers.known`. None is the map's calibration, or any without one; -1 is any.
+        sequence: a filter over the map's images in order, for queries that are consecutive frames
+            of one camera; None answers every query independently.
+        where: which images of the map to search, such as "folder=monday, added>=2026-05-01"
+            (`Where.parse`); None is all, which `sequence` requires.
+        verify: how to verify the best answers by local features and rank them by their inliers
+            (docs/verification.md); None ranks them by similarity.
         reading: how images are read.
 
     Returns:
-        The answers, of use after the map is closed too.
+        The answers, which remain usable after the map is closed.
 
     Raises:
         InputError: another model; no image, one that cannot be read, or none that can; a number
@@ -194,7 +194,7 @@ def query(
 
     def stream() -> Iterator[Described]:
         first = 0
-        for some in [paths] if window == 1 else sources:  # a window is of one source
+        for some in [paths] if window == 1 else sources:  # a window is within one source
             for part in described(describer, some, reading, **how):
                 yield Described(part.indices + first, part.descriptors, part.unreadable + first)
             first += len(some)
@@ -221,7 +221,7 @@ def _read_each(paths: Sequence[pathlib.Path], bar: Bar) -> Iterator[np.ndarray]:
 
 
 Ask = Callable[[Float32[np.ndarray, "query d"], Sequence[pathlib.Path]], Neighbours | TrackResult]
-"""Finds the answers to described images, given their names too."""
+"""Finds the answers to images from their descriptors and names."""
 
 
 def asking(
@@ -233,12 +233,12 @@ def asking(
     *,
     exact: bool = False,
 ) -> Ask:
-    """Return what asks a map for k answers: its search, or a filter over consecutive frames.
+    """Return a function that finds k answers: by the map's search, or by a filter over frames.
 
-    More are asked for where more are verified, of which `verified` leaves k.
+    If more than k are to be verified, it finds as many, of which `verified` returns k.
 
     Raises:
-        InputError: conditions that no image meets, or for such a filter, which is of all images.
+        InputError: conditions that no image meets, or for such a filter, which needs all images.
     """
     if verifier is not None:
         k = max(k, verifier.verify.answers)
@@ -258,7 +258,7 @@ def answers_of(
     thresholds: Thresholds,
     **more: Any,
 ) -> Answers:
-    """Join what `asking` found, part by part; `more` are other fields of `Answers`."""
+    """Join the parts that `asking` found; `more` are other fields of `Answers`."""
     indices, similarities, *filtered = map(np.concatenate, zip(*found, strict=True))
     neighbours = Neighbours(indices, similarities)
     more |= dict(zip(("probabilities", "best"), filtered, strict=False))  # of a filter
@@ -267,13 +267,13 @@ def answers_of(
 
 
 def verified(answers: Answers, verifier: Verifier, images: Iterable[np.ndarray], k: int) -> Answers:
-    """Verify answers, put the verified ones in order by their inliers, and leave k of each query.
+    """Verify answers, rank the verified ones by their inliers, and return k per query.
 
     Args:
         answers: what `asking` finds.
-        verifier: what verifies.
-        images: the queries.
-        k: answers to each query that are left.
+        verifier: the verifier.
+        images: the images of the queries.
+        k: number of answers per query that are returned.
 
     Raises:
         InputError: what `Verifier.check` raises.
@@ -306,19 +306,19 @@ def verified(answers: Answers, verifier: Verifier, images: Iterable[np.ndarray],
 def asked_thresholds(
     places: Map, min_similarity: float | None, verifier: Verifier | None
 ) -> Thresholds:
-    """Return the similarity and the inliers that best answers must have; None where any counts.
+    """Return the minimum similarity and number of inliers of best answers; None accepts any.
 
     Args:
-        places: the map, which may remember them.
-        min_similarity: as of `query`.
-        verifier: what verifies answers, which may say the inliers; None is nothing.
+        places: the map, whose calibration may have them.
+        min_similarity: as in `query`.
+        verifier: the verifier of answers, which may set the inliers; None verifies none.
 
     Raises:
-        InputError: the similarity is no cosine; what `calibration_of` raises.
+        InputError: the similarity is not a cosine; what `calibration_of` raises.
     """
     inliers = None if verifier is None else verifier.verify.min_inliers
     measured = calibration_of(places, verifier) if None in (min_similarity, inliers) else None
-    if measured is not None:  # without verified answers, of no inliers
+    if measured is not None:  # its inliers are 0 if answers were not verified
         min_similarity = measured.min_similarity if min_similarity is None else min_similarity
         inliers = measured.min_inliers if inliers is None else inliers
     if min_similarity is not None:
@@ -330,13 +330,13 @@ def asked_thresholds(
 def _below_one_root(
     sources: Sequence[ImageSource],
 ) -> tuple[pathlib.Path, list[list[pathlib.Path]]]:
-    """List the images of each source, below a folder that holds all."""
+    """List the images of each source, below a folder that contains them all."""
     roots = {source.root for source in sources}
     if len(roots) == 1:
         return roots.pop(), _runs([source.paths for source in sources])
     if len(set(map(is_remote, roots))) > 1:
         raise InputError("images: found files and addresses, expected only one of the two")
-    # Written out, as relative and absolute ones have no folder in common.
+    # As full paths, since relative and absolute ones have no folder in common.
     whole = os.fspath if is_remote(min(roots)) else os.path.abspath
     paths = [[pathlib.Path(whole(path)) for path in source.paths] for source in sources]
     root = pathlib.Path(os.path.commonpath([whole(root) for root in roots]))
@@ -344,7 +344,7 @@ def _below_one_root(
 
 
 def _runs(sources: Sequence[Sequence[pathlib.Path]]) -> list[list[pathlib.Path]]:
-    """Join images named one after the other to one source: a shell writes a pattern out so."""
+    """Join images named one after the other into one source: shells expand a pattern this way."""
     runs: list[list[pathlib.Path]] = []
     for is_one, run in itertools.groupby(sources, lambda paths: len(paths) == 1):
         each = [list(paths) for paths in run]
@@ -360,7 +360,7 @@ def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, 
 
 
 def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any]:
-    """Return an answer's rank, name, similarity and position, as JSON has them."""
+    """Return an answer's rank, name, similarity and position as JSON values."""
     fields: dict[str, Any] = {
         "rank": answer.rank,
         "name": answer.image.name,
@@ -377,17 +377,16 @@ def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any
 def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
-    Names of queries are relative to their source, as those of a map's images are.
-    Frames of videos have a `time` in seconds, too, and metres of UTM their `zone`. Where answers
-    must have a similarity, the line says whether the query is of a `known` place; the answers of an
-    unknown one are listed all the same. Where a name has letters that no text shows, or bytes that
-    are no UTF-8, they are escaped.
+    Names of queries are relative to their source, like those of a map's images. Frames of videos
+    also have a `time` in seconds, and UTM metres their `zone`. If answers must have a minimum
+    similarity, the line says whether the query is of a `known` place; the answers of an unknown one
+    are still listed. Unprintable characters in a name, or bytes that are not UTF-8, are escaped.
     """
     return map(json_text, json_rows(answers))
 
 
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
-    """Yield what `json_lines` writes of each query."""
+    """Yield what `json_lines` writes for each query."""
     zone = {} if answers.zone is None else {"zone": str(answers.zone)}
     poses = answers.poses or [None] * len(answers.queries)
     columns = answers.names, answers.known, poses, answers.rows()

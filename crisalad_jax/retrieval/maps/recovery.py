@@ -1,4 +1,4 @@
-"""Descriptors of a map that no record counts: what a kill left of an addition, or a lost record."""
+"""Descriptors of a map without a record, left by a killed addition or by the loss of a record."""
 
 import pathlib
 
@@ -10,17 +10,17 @@ from crisalad_jax.utils.output import warn
 
 
 def remove_unrecorded(folder: pathlib.Path, images: int) -> None:
-    """Remove the descriptors in files that no record counts, with a note.
+    """Remove the files of descriptors that have no record, with a warning.
 
     A kill leaves at most one addition without a record. A map gets its calibration, and its
     approximate search, only once it has images.
 
     Args:
-        folder: the map's, whose lock is held.
-        images: number of images that its records count, those that were removed included.
+        folder: the map's folder, whose lock is held.
+        images: number of images in its records, including removed ones.
 
     Raises:
-        InputError: more is left than a kill leaves, so that a record was lost.
+        InputError: more is left than a kill leaves, so a record was lost.
     """
     files = sorted((folder / SEGMENTS).glob("[0-9]*.npy"))
     recorded = {path.name.partition(".")[0] for path in (folder / SEGMENTS).glob("[0-9]*.json")}

@@ -45,7 +45,7 @@ def source_of_map(places: Map) -> ImageSource:
         The images, and where they were taken.
 
     Raises:
-        InputError: a file is gone or has another size; or folders of which one is at an address.
+        InputError: a file is gone or has another size; or one of several folders is remote.
     """
     check_images(places)
     roots: dict[str, list[str]] = {}
@@ -84,7 +84,7 @@ def check_remakeable(folder: str | os.PathLike[str]) -> MapMetadata:
 
     Raises:
         InputError: its descriptors are in Milvus, components shorten them, or the folder holds
-            other files too, such as pictures that a service was sent, which would be lost.
+            other files too, such as pictures sent to a service, which would be lost.
     """
     folder, metadata = pathlib.Path(folder), existing_metadata(folder)
     advice = "`crisalad index` makes another map"
@@ -116,15 +116,14 @@ def remake_map(
 ) -> int:
     """Rebuild a map by describing its images with another model.
 
-    The new map is exchanged with the old one in a single step when it is complete, so a call that
-    is killed leaves one of them. Positions, folders, days and the kind of search are preserved. The
-    calibration and the record of removed images are not. A running service continues with the old
-    map.
+    The new map replaces the old one in a single step when it is complete, so a killed call leaves
+    one or the other. Positions, folders, days and the kind of search are preserved. The calibration
+    and the record of removed images are not. A running service continues with the old map.
 
     Args:
-        folder: the map's.
-        model: what describes the images.
-        weights: the file of the model, which queries load by default.
+        folder: the map's folder.
+        model: the model that describes the images.
+        weights: the model's file, which queries load by default.
         reading: how images are read; each must be readable.
 
     Returns:
@@ -159,7 +158,7 @@ def remake_map(
     calibrated = any(folder.glob("calibration*"))
     new = folder.with_name(f".{folder.name}.remake")
     with open_for_appending(folder, existing) as places, in_use(new):
-        shutil.rmtree(new, ignore_errors=True)  # of a call that was killed
+        shutil.rmtree(new, ignore_errors=True)  # left by a killed call
         with (
             open_for_appending(new, metadata) as target,
             progress_bar("images", len(places), "images", quiet=reading.quiet) as bar,

@@ -16,8 +16,8 @@ class Removed(NamedTuple):
     rows: Int64[np.ndarray, " removed"] = np.empty(0, np.int64)
     """In ascending order."""
     asked: "tuple[Where, Int64[np.ndarray, ' removed']] | None" = None
-    """Conditions on images as they were added that leave the same in, where some rows are removed:
-    what a database is asked. None where there are none."""
+    """The same selection for a database: conditions on images as they were added, and the rows
+    removed in addition. None if there is no such form."""
 
     def has(self, row: int) -> bool:
         """Return whether a row was removed."""
@@ -34,7 +34,7 @@ class Removed(NamedTuple):
         return numbers + np.searchsorted(left_before, numbers, side="right")
 
     def left(self, first: int, count: int) -> Int64[np.ndarray, " left"] | None:
-        """Return the places that are left of `count` rows from `first` on; None where all are."""
+        """Return the places that are left of `count` rows from `first` on; None if all are."""
         start, end = np.searchsorted(self.rows, [first, first + count])
         gone = self.rows[start:end] - first
         return np.delete(np.arange(count), gone) if gone.size else None

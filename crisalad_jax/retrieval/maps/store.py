@@ -1,7 +1,7 @@
-"""Where a map's descriptors are: files, or Milvus, behind one interface.
+"""Stores of a map's descriptors: files or Milvus, behind one interface.
 
-A store knows descriptors by their numbers, from 0, and nothing of images. The map says how many of
-them count. Descriptors beyond, which a killed addition left, are never returned, and the next
+A store knows descriptors by number, from 0, and nothing about images. The map says how many of them
+count. Descriptors beyond these, left by a killed addition, are never returned, and the next
 addition overwrites them.
 """
 
@@ -22,14 +22,14 @@ _MILVUS = "milvus:"
 
 
 Store = FileStore | MilvusStore
-"""Descriptors by number. Each method raises InputError where the store is damaged or gone."""
+"""Descriptors by number. Each method raises InputError if the store is damaged or gone."""
 
 
 def check_store(name: str, dtype: str) -> None:
-    """Check the name of a store, and that it holds descriptors of a type.
+    """Check the name of a store, and that it can hold descriptors of a type.
 
     Raises:
-        InputError: neither "files" nor "milvus:URI", or such an URI or type that Milvus has not.
+        InputError: neither "files" nor "milvus:URI", or a URI or type that Milvus lacks.
     """
     if name != "files":
         require(name.startswith(_MILVUS), f"store: found {name!r}, expected files or milvus:URI")
@@ -39,10 +39,10 @@ def check_store(name: str, dtype: str) -> None:
 
 
 def store_name(name: str, folder: pathlib.Path) -> str:
-    """Return the name that a map in `folder` records of a store on the command line.
+    """Return the name that a map in `folder` records for a store from the command line.
 
-    It holds a file of Milvus by its absolute path, or by one relative to the map's folder if it is
-    inside.
+    It contains the absolute path of a Milvus file, or the path relative to the map's folder if the
+    file is inside.
     """
     address = name.removeprefix(_MILVUS)
     if name == "files" or check_address(address):
@@ -55,9 +55,9 @@ def open_store(metadata: "MapMetadata", folder: pathlib.Path, *, new: bool) -> S
     """Open the store of the map in `folder`.
 
     Args:
-        metadata: the map's.
-        folder: the map's.
-        new: whether the store is made anew, in place of one that a kill left unfinished.
+        metadata: the map's metadata.
+        folder: the map's folder.
+        new: whether to create the store, in place of one that a kill left unfinished.
 
     Raises:
         InputError: it cannot be reached, is missing, or holds something else.

@@ -1,4 +1,4 @@
-"""Answers of a map to consecutive frames of one camera, by a search over its images in order."""
+"""Locate consecutive frames of one camera in a map, by a search over its images in order."""
 
 import itertools
 import math
@@ -19,33 +19,33 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, Float64, Int64
 
 SequenceSearch = BayesFilter | SeqSlam
-"""What finds a camera by its frames so far."""
+"""Locates a camera by its frames so far."""
 _NUMBERS = 2**25
 """Similarities computed at a time: 128 MiB."""
 _GAP = 1e9
-"""Seconds from one video of a map to the next: no camera reaches as far."""
+"""Seconds from one video of a map to the next: farther than any camera moves."""
 
 _Spot = tuple[str, tuple[float, ...]]
-"""A clock and the seconds on it, when an image was taken; or nothing, and the metres where."""
+"""When an image was taken, as a clock and its seconds; or where, as a zone or "" and metres."""
 
 
 @brief
 class TrackResult(NamedTuple):
-    """Images of a map at each of some frames, the most probable first."""
+    """Images of a map for each of some frames, the most probable first."""
 
     numbers: Int64[np.ndarray, "frame k"]
     similarities: Float32[np.ndarray, "frame k"]
     probabilities: Float64[np.ndarray, "frame k"]
-    """Probability of each image that the camera is there."""
+    """Probability that the camera is at each image."""
     best: Float32[np.ndarray, " frame"]
-    """Similarity of the image of the whole map that is most similar to the frame."""
+    """Similarity of the image in the entire map that is most similar to the frame."""
 
 
 class SequenceTracker:
-    """A camera that is followed through a map, a few frames at a time."""
+    """Tracks a camera through a map, a few frames at a time."""
 
     def __init__(self, places: Map, search: SequenceSearch) -> None:
-        """Begin a sequence in a map, whose descriptors are read twice."""
+        """Start a sequence in a map, whose descriptors are read twice."""
         self._map = places
         self._filter: Any = search
         total = sum(part.sum(axis=0, dtype=np.float64) for part in places.descriptors)
@@ -58,15 +58,15 @@ class SequenceTracker:
     def answer(
         self, descriptors: Float32[np.ndarray, "frame d"], k: int, frames: Sequence[pathlib.Path]
     ) -> "TrackResult":
-        """Take the next frames into account, and rank the map's images at each of them.
+        """Update the camera's state with the next frames, and rank the map's images for each.
 
-        Motion is in metres where the map has a position of every image, and the names of the first
-        frames say @UTM positions; else in seconds where names on both sides say times; else in
-        images of the map a frame, which a note tells.
+        Motion is in metres if the map has a position for every image and the names of the first
+        frames contain @UTM positions; else in seconds if names on both sides contain times; else in
+        images of the map per frame, with a warning.
 
         Args:
             descriptors: unit descriptors of the frames in order, of the map's model.
-            k: images for each frame; all where there are fewer.
+            k: images per frame; all if there are fewer.
             frames: their names.
 
         Returns:
@@ -105,7 +105,7 @@ class SequenceTracker:
         )
 
     def _moved(self, frame: pathlib.Path) -> float:
-        """Return how far the camera moved since the frame before; infinity where unknown."""
+        """Return how far the camera moved since the previous frame; infinity if unknown."""
         if self._read is None:
             return 1.0
         before, self._before = self._before, self._read(str(frame))
@@ -113,7 +113,7 @@ class SequenceTracker:
 
 
 def _apart(first: _Spot | None, second: _Spot | None) -> float:
-    """Return the seconds or metres between two images; infinity where they say nothing of it."""
+    """Return the seconds or metres between two images; infinity if unknown."""
     if first is None or second is None or first[0] != second[0]:
         return math.inf
     return math.dist(first[1], second[1])
@@ -126,7 +126,7 @@ def _when(name: str) -> _Spot | None:
 
 def _where(name: str) -> _Spot | None:
     found = utm_positions([pathlib.PurePath(name).name])
-    # Two zones are two clocks: their metres say nothing of how far the camera moved.
+    # Two zones are like two clocks: their metres do not show how far the camera moved.
     return (str(found.zone), next(iter(found.of.values()))) if found.of else None
 
 

@@ -1,4 +1,4 @@
-"""Verification of the answers of a map: their order by inliers, and the camera's place."""
+"""Verify the answers of a map: rank them by inliers, and compute the camera's pose."""
 
 from collections.abc import Sequence
 
@@ -22,18 +22,18 @@ def verify_answers(
     similarities: Float32[np.ndarray, " n"],
     axes: tuple[str, str] | None,
 ) -> tuple[Int64[np.ndarray, " n"], list[Verification], MapPose | None]:
-    """Verify answers to a query, put them in order, and compute where its camera was.
+    """Verify answers to a query, rank them, and compute where its camera was.
 
     Args:
-        verifier: what verifies.
+        verifier: the verifier.
         image: the query.
         found: the answers, best first.
-        similarities: theirs.
-        axes: of their positions; None where there are none.
+        similarities: similarities of the answers.
+        axes: axes of their positions; None if there are none.
 
     Returns:
-        The answers' numbers, as `order_by_inliers` has them; their verifications in that order; and
-        where the query's camera was, as far as two answers say so.
+        The answers' numbers in the order of `order_by_inliers`; their verifications in that order;
+        and where the query's camera was, or None if no two answers determine it.
 
     Raises:
         InputError: what `Verifier.check` raises.
@@ -61,15 +61,15 @@ def verify_answers(
 
 
 def _metres(position: tuple[float, float], zone: Zone | None) -> Float64[np.ndarray, " 2"]:
-    """Return a position in metres; None is in metres already."""
+    """Convert a position to metres; with a zone of None it is in metres already."""
     given = np.array([position])
     return given[0] if zone is None else np.concatenate(zone.to_metres(*given.T))
 
 
 def calibration_of(places: Map, verifier: Verifier | None) -> Calibration | None:
-    """Return what a map remembers of verified answers or, without that, of similarities.
+    """Return a map's calibration of verified answers or, without one, of similarities.
 
-    A calibration by another matcher is not used, and a note says so.
+    A calibration by another matcher is not used, and a warning says so.
 
     Raises:
         InputError: the file is damaged, or of another model.

@@ -1,4 +1,4 @@
-"""Conditions on the images of a map that a search is of: their folder, times and positions."""
+"""Conditions on the images of a map that are searched: their folder, times and positions."""
 
 import dataclasses
 import datetime
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from crisalad_jax.retrieval.maps.images import Images
 
 Interval = tuple[float, float]
-"""Seconds since 1970, of which the first counts and the last does not."""
+"""Seconds since 1970, including the first and excluding the last."""
 ALWAYS: Interval = (-math.inf, math.inf)
 _KEYS = "folder=, added>=, time>= (or >, <, <=, =) or box="
 _CONDITION = re.compile(r"((?:folder|box)\s*(?==)|added|time)\s*([<>]=?|=)\s*(.+)", re.S)
@@ -30,7 +30,7 @@ _DAY = 86400.0
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class Where:
-    """Conditions on images of a map; an image counts that meets all of them.
+    """Conditions on images of a map; images that meet all of them are searched.
 
     Example:
         >>> Where.parse("folder=monday, added>=2026-05-01, box=11.5,48.1,11.6,48.2")
@@ -38,30 +38,30 @@ class Where:
     """
 
     folder: str = ""
-    """Folder, video, or log and its topic, that the names are in, with all below it; with * at the
-    end, what the names begin with. Empty is any."""
+    """Folder, video, or log and its topic, that contains the image, at any depth; with * at the
+    end, a prefix of the name. Empty is any."""
     added: Interval = ALWAYS
     """When the image was added to the map, as its record says."""
     time: Interval = ALWAYS
-    """When the image was taken, where its name says that in seconds since 1970, as those of frames
-    of logs do. Images that say no time count with any interval only."""
+    """When the image was taken, if its name says so in seconds since 1970, as names of log frames
+    do. Images without such a time meet only the default."""
     box: tuple[float, float, float, float] | None = None
-    """West, south, east and north of the position, ends included: in the map's axes, so degrees or
-    metres. In degrees the west may be the larger: a box over the antimeridian (RFC 7946, 5.2)."""
+    """West, south, east and north of the position, ends included, in the map's axes: degrees or
+    metres. In degrees, west may exceed east: a box across the antimeridian (RFC 7946, 5.2)."""
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read conditions, with commas between them.
+        """Parse conditions separated by commas.
 
-        A day stands for all of it, a time for its second: `added<=2026-05-01` takes what was added
-        on that day. Times without a zone are UTC.
+        A day means all of it, a time its second: `added<=2026-05-01` includes what was added on
+        that day. Times without a zone are UTC.
 
         Args:
             text: such as "folder=monday, added>=2026-05-01, time<2026-05-01T12:00,
-                box=11.5,48.1,11.6,48.2", of which any may be left out, and times be said twice.
+                box=11.5,48.1,11.6,48.2", any of which may be omitted; times may be given twice.
 
         Raises:
-            InputError: another key, no or a second value, or one that is no time or no box.
+            InputError: another key, no or a second value, or one that is not a time or a box.
         """
         found: dict[str, Any] = {}
         for part in re.split(r",(?=\s*\w+\s*[<>=])", text):
@@ -79,22 +79,22 @@ class Where:
 
     @property
     def prefixes(self) -> tuple[str, ...]:
-        """What names begin with, one of these; a frame's has # behind its video, log or topic."""
+        """Prefixes of names that match; a frame's name has # after its video, log or topic."""
         if self.folder.endswith("*"):
             return (self.folder.removesuffix("*"),)
         folder = self.folder.rstrip("/")
         return f"{folder}/", f"{folder}#"
 
     def left_out(self, images: "Images", axes: tuple[str, str] | None) -> Removed:
-        """Find the rows that do not count: of images that do not meet all conditions, or removed.
+        """Find the rows to leave out: of images that do not meet all conditions, or were removed.
 
         Args:
-            images: the map's.
-            axes: of their positions; None where they have none.
+            images: the map's images.
+            axes: axes of their positions; None if they have none.
 
         Raises:
-            InputError: no image counts; a box where there are no positions, or in metres with its
-                west larger than its east.
+            InputError: no image is left; a box without positions, or one in metres whose west is
+                larger than its east.
         """
         masks: dict[str, Bool[np.ndarray, " row"]] = {}
         if self.folder:
@@ -134,7 +134,7 @@ class Where:
 
 
 def _interval(sign: str, text: str) -> Interval:
-    """Return the times that a comparison with a day or a time takes."""
+    """Return the interval of times that a comparison with a day or a time accepts."""
     try:
         try:
             start = time_of(datetime.date.fromisoformat(text).isoformat())

@@ -1,4 +1,4 @@
-"""A second stage over any first: its best retrievals in the order of what their patches show."""
+"""Re-rank the best retrievals of any first stage by local features."""
 
 from crisalad_jax.retrieval.reranking.stage import RERANKERS as RERANKERS
 from crisalad_jax.retrieval.reranking.stage import Reranker as Reranker

@@ -32,7 +32,7 @@ def shape(config: ModelConfig) -> tuple[int, int]:
 def describe(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image token dim"]:
-    """Compute unit local tokens of every image, which depend on no other, in float16."""
+    """Compute the unit local tokens of every image independently, in float16."""
     return l2_normalise(extract_tokens(params, images, config).local).astype(jnp.float16)
 
 

@@ -1,4 +1,4 @@
-"""FoL's second stage: local features around the patches of most mass (Wang et al., AAAI 2025).
+"""FoL's second stage: local features around the patches with most mass (Wang et al., AAAI 2025).
 
 The paper's equations, with the constants of the public model.
 """
@@ -21,16 +21,16 @@ from crisalad_jax.utils import compiler
 CHOSEN = 225
 """Number of patches whose features are compared, whatever the image size."""
 _LEAST_ROWS = 19
-"""Rows of patches below which the public code has too little room for their features."""
+"""Minimum rows of patches; with fewer, the public code has too little room for their features."""
 _OUTLIERS, _USUAL = 3, 0.05
-"""Number of largest masses that do not count as they are, and the share of patches above the one
-whose mass they get."""
+"""Number of largest masses that are replaced, and the share of patches above the one whose mass
+replaces them."""
 LEAST_COSINE = 0.7
 """Cosine above which features match."""
 
 
 def shape(config: ModelConfig) -> tuple[int, int]:
-    """Return the largest number of local features of an image, and their width.
+    """Return the maximum number of local features of an image, and their width.
 
     Raises:
         InputError: the images have too few patches.
@@ -50,7 +50,7 @@ def shape(config: ModelConfig) -> tuple[int, int]:
 def confidence(plan: Float[Array, "patch column"]) -> Float[Array, " patch"]:
     """Compute the mean mass that a patch sends to a cluster, without the largest outliers.
 
-    The largest three take the value that one in twenty of the patches exceed.
+    The largest three are set to the value that one in twenty of the patches exceeds.
 
     Args:
         plan: the mass that each patch sends to each cluster, and in the last column to the dustbin.
@@ -63,7 +63,7 @@ def confidence(plan: Float[Array, "patch column"]) -> Float[Array, " patch"]:
 def chosen_features(
     confidences: Float[Array, " patch"], local: Float[Array, "rows columns local"]
 ) -> Float[Array, "feature local"]:
-    """Return the local features over the most confident patches, in row order, and then zeros."""
+    """Return the local features of the most confident patches in row order, padded with zeros."""
     rows, columns, _ = local.shape
     size = [(side - 1) // SCALE**2 + 1 for side in (rows, columns)]
     first = jax.lax.top_k(confidences, CHOSEN)[1]
@@ -75,7 +75,7 @@ def chosen_features(
 
 
 def _nearest(source: int, target: int) -> Int[np.ndarray, " target"]:
-    """Return the cell that torch's nearest interpolation takes, with its roundings in float32."""
+    """Return the cells that torch's nearest interpolation takes, with its float32 rounding."""
     scale = np.float32(source) / np.float32(target)
     return np.floor(np.arange(target, dtype=np.float32) * scale).astype(int)
 
@@ -96,7 +96,7 @@ def describe(
 def count_matches(
     query: matching.Features, candidates: matching.Features, config: ModelConfig
 ) -> matching.Scores:
-    """Count the mutual matches of a cosine above `LEAST_COSINE`; one alone counts as none."""
+    """Count the mutual matches with a cosine above `LEAST_COSINE`; a single one counts as none."""
     matches = np.asarray(matching.match_all(query, candidates, LEAST_COSINE))
     counts = (matches >= 0).sum(axis=1)
     return np.where(counts == 1, 0, counts).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The second stage that verifies retrievals by local features of the images' own size."""
+"""The second stage that verifies retrievals by local features at the images' original size."""
 
 import pathlib
 from collections.abc import Iterable, Sequence
@@ -12,9 +12,9 @@ from crisalad_jax.retrieval.verification.verify import Verifier, order_by_inlier
 
 
 class LocalReranker(SecondStage):
-    """Puts each query's first neighbours in order by similarity and inliers.
+    """Re-ranks the first neighbours of each query by similarity and inliers.
 
-    Their inliers replace their similarities.
+    The numbers of inliers replace the similarities.
     """
 
     def __init__(
@@ -24,12 +24,12 @@ class LocalReranker(SecondStage):
         queries: Sequence[pathlib.Path],
         reading: Reading,
     ) -> None:
-        """Prepare the second stage over these images."""
+        """Prepare the second stage for these images."""
         super().__init__("local", verifier.verify.answers, reading)
         self._verifier, self._database, self._queries = verifier, database, queries
 
     def compare(self, query: int, candidates: Sequence[int]) -> Iterable[int]:
-        """Count the inliers of a query and each of some candidates."""
+        """Count the inliers of a query with each candidate."""
         if not candidates:
             return []
         files = [self._database[each] for each in candidates]
@@ -38,5 +38,5 @@ class LocalReranker(SecondStage):
         return [check.inliers for check in checks]
 
     def order(self, scores: np.ndarray, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Put candidates in order; see `order_by_inliers`."""
+        """Order the candidates; see `order_by_inliers`."""
         return order_by_inliers(similarities, scores), scores

@@ -1,4 +1,4 @@
-"""Matches of two images' patches, and the scores of SelaVPR and TransVPR that count them."""
+"""Match the patches of two images, and score pairs by their matches as SelaVPR and TransVPR do."""
 
 import dataclasses
 import functools
@@ -22,22 +22,22 @@ from crisalad_jax.nn.model import AnyArray, Crisalad, Images, describe, extract_
 from crisalad_jax.utils import compiler
 
 Features = Float[np.ndarray, "*candidate feature dim"]
-"""Local features of an image, or of each of some candidates."""
+"""Local features of an image, or of each candidate."""
 Scores = Float[np.ndarray, "candidate *part"]
-"""Scores of some candidates of a query: one of each, or one of each part."""
+"""Scores of the candidates of a query: one each, or one for each part."""
 INLIER_DISTANCE = 1.5
-"""Largest distance of an inlier from where the homography maps it, in patches (public codes)."""
+"""Maximum distance of an inlier from where the homography maps it, in patches (public code)."""
 _LEAST_MATCHES = 4
-"""Number of matches that a homography needs."""
+"""Minimum number of matches for a homography."""
 
 
 def mutual_matches(
     query: Float[AnyArray, "m d"], candidate: Float[AnyArray, "n d"], above: float = -math.inf
 ) -> Int[Array, " m"]:
-    """Match patches that are each other's nearest: for each of the query's, the candidate's.
+    """Match mutual nearest patches: for each patch of the query, find that of the candidate.
 
-    The nearest patch has the largest inner product; of equal ones it is the first. The result is
-    -1 where there is no match of a product larger than `above`. Patches of zeros match nothing.
+    The nearest patch has the largest inner product; ties go to the first. The result is -1 where no
+    match has a product larger than `above`. Patches of zeros match nothing.
     """
     query, candidate = query.astype(jnp.float32), candidate.astype(jnp.float32)
     products = jnp.matmul(query, candidate.T, precision=jax.lax.Precision.HIGHEST)
@@ -51,14 +51,14 @@ def mutual_matches(
 def spatial_score(matches: Int[Array, " m"], grid: tuple[int, int]) -> Float[Array, ""]:
     """Compute Patch-NetVLAD's rapid spatial score (Hausler et al., CVPR 2021, section 3.4).
 
-    A match's displacement on the grid, minus the mean displacement, is subtracted from the largest
-    possible one. The squares are summed over matches, rows and columns, and divided by the number
-    of patches. A displacement beyond the largest adds nothing; the printed formula would add its
-    square again.
+    The deviation of a match's displacement from the mean is subtracted from the largest possible
+    displacement on the grid. The squares are summed over matches, rows and columns, and divided by
+    the number of patches. A deviation beyond the largest displacement adds nothing; the printed
+    formula would add its square again.
 
     Args:
         matches: from `mutual_matches`, of patches in row order.
-        grid: rows and columns of patches, the same of both images.
+        grid: rows and columns of patches, the same for both images.
     """
     here = _places(jnp.arange(len(matches)), grid)
     moved = (_places(matches, grid) - here).astype(jnp.float32)
@@ -74,9 +74,9 @@ def _places(patches: Int[Array, " m"], grid: tuple[int, int]) -> Int[Array, "m 2
 
 
 def inliers(matches: Int[np.ndarray, " m"], grid: tuple[int, int]) -> int:
-    """Count the matches that one homography explains, found by RANSAC from a fixed seed.
+    """Count the matches that one homography explains, found by RANSAC with a fixed seed.
 
-    The arguments are those of `spatial_score`. Fewer than four matches are explained by none.
+    The arguments are those of `spatial_score`. Fewer than four matches have no homography.
     """
     query = np.flatnonzero(matches >= 0)
     if len(query) < _LEAST_MATCHES:
@@ -98,7 +98,7 @@ def match_all(
     above: float = -math.inf,
 ) -> Int[Array, "candidate m"]:
     """Match a query's patches with those of each candidate; see `mutual_matches`."""
-    # One after the other: the products of a pair of SelaVPR's images of 224 x 224 are 55 MB.
+    # One at a time: the products of a pair of 224 x 224 images in SelaVPR take 55 MB.
     return jax.lax.map(functools.partial(mutual_matches, query, above=above), candidates)
 
 
@@ -126,7 +126,7 @@ def count_matches(query: Features, candidates: Features, config: ModelConfig) ->
 
 
 def selavprpp_shape(config: ModelConfig) -> tuple[int, int]:
-    """Return 1 and the length of SelaVPR++'s descriptor of real numbers."""
+    """Return 1 and the length of SelaVPR++'s real-valued descriptor."""
     assert isinstance(config.aggregator, SelaVprPpHashConfig)
     return 1, config.aggregator.dim
 
@@ -135,7 +135,7 @@ def selavprpp_shape(config: ModelConfig) -> tuple[int, int]:
 def describe_selavprpp(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image 1 dim"]:
-    """Compute SelaVPR++'s descriptor of real numbers of every image, a unit vector."""
+    """Compute SelaVPR++'s real-valued descriptor of every image, a unit vector."""
     assert isinstance(params.aggregator, SelaVprPpHash)
     assert isinstance(config.aggregator, SelaVprPpHashConfig)
     params = dataclasses.replace(params, aggregator=params.aggregator.real)
@@ -144,7 +144,7 @@ def describe_selavprpp(
 
 
 def nearness(query: Features, candidates: Features, config: ModelConfig) -> Scores:
-    """Compute the negative distance of the only feature of each image."""
+    """Compute the negative distance between the single features of query and candidates."""
     return -np.linalg.norm(candidates[:, 0] - query[0], axis=1)
 
 

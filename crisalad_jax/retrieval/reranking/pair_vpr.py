@@ -15,7 +15,7 @@ from crisalad_jax.utils import compiler
 def describe(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch dim"]:
-    """Compute the patches of every image by the backbone's last layer norm, in float16."""
+    """Compute the patches of every image after the backbone's last layer norm, in float16."""
     return extract_features(params, images, config).patches.astype(jnp.float16)
 
 
@@ -26,7 +26,7 @@ def scores(
     candidates: Float[AnyArray, "candidate patch dim"],
     config: ModelConfig,
 ) -> Float[Array, " candidate"]:
-    """Sum the logits of each pair in its two orders."""
+    """Sum the logits of each pair in both orders."""
     assert isinstance(config.aggregator, PairVprConfig)
     theirs = jnp.asarray(candidates, config.compute_dtype)
     ours = jnp.broadcast_to(jnp.asarray(query, config.compute_dtype), theirs.shape)

@@ -1,6 +1,6 @@
 """Patch-NetVLAD: VLADs of windows of several sizes (Hausler et al., CVPR 2021, section 3).
 
-What the authors' code (QVPR/Patch-NetVLAD) settles where the paper leaves it open is taken from it.
+Where the paper leaves something open, this follows the authors' code (QVPR/Patch-NetVLAD).
 """
 
 import functools
@@ -29,16 +29,16 @@ from crisalad_jax.utils.errors import InputError
 Grid = tuple[int, int]
 
 WINDOWS = ((2, 0.45), (5, 0.15), (8, 0.4))
-"""Sides in patches and weights of the paper's multi-scale score; windows are a patch apart."""
+"""Window sides in patches and weights of the paper's multi-scale score; the stride is a patch."""
 
 
 def windows_of(config: ModelConfig) -> list[tuple[int, float, Grid]]:
-    """List side, weight, and rows and columns of the windows that fit this model's images.
+    """List side, weight, and rows and columns of the windows that fit the images of a model.
 
     Sizes of which fewer than 2 x 2 fit are left out: a single window cannot be displaced.
 
     Raises:
-        InputError: no size is left.
+        InputError: no size fits.
     """
     rows, columns = config.grid
     fitting = [
@@ -65,9 +65,9 @@ def window_vlads(
 ) -> Float[Array, "window vlad"]:
     """Compute a VLAD for every window of side x side patches, in row order (Eq. 2 and 4).
 
-    Assigned residuals are summed, normalised cluster by cluster, and as a whole. Sums are shared by
-    neighbouring windows along rows, then along columns. The paper's integral features take fewer
-    additions, but subtract large sums. For a cluster with little mass in a window only rounding
+    Assigned residuals are summed, and normalised first per cluster, then as a whole. Neighbouring
+    windows share sums along rows, then along columns. The paper's integral features need fewer
+    additions, but subtract large sums: for a cluster with little mass in a window, only rounding
     errors would remain, which the normalisation would scale up.
     """
     residuals = assignment[:, :, None] * (features[:, None, :] - centroids)
@@ -84,7 +84,7 @@ def shape(config: ModelConfig) -> tuple[int, int]:
     """Return the number of windows of an image, of all sizes, and the length of a descriptor.
 
     Raises:
-        InputError: what `windows_of` raises; windows' descriptors would be no unit vectors.
+        InputError: what `windows_of` raises; the descriptors would not be unit vectors.
     """
     check_unit_length(config, "rerank")
     windows = sum(rows * columns for _, _, (rows, columns) in windows_of(config))
@@ -97,7 +97,7 @@ def describe(
 ) -> Float[Array, "image window dim"]:
     """Compute unit descriptors of all windows, the smallest size first, in float16.
 
-    The model's projection, if it has one, shortens every window's VLAD as it does the image's.
+    The model's projection, if it has one, reduces each window's VLAD as it does the image's.
     """
     aggregator, projection = params.aggregator, params.projection
     assert isinstance(aggregator, NetVlad)
@@ -113,7 +113,7 @@ def describe(
         parts = [of_size(*image, side) for side, _, _ in windows_of(config)]
         return jnp.concatenate(parts).astype(jnp.float16)
 
-    # Images run one after the other: the residuals of one are as large as all of its windows.
+    # One image at a time: the residuals of an image are as large as all of its windows.
     return jax.lax.map(of_one, (assignment, features))
 
 
@@ -123,7 +123,7 @@ def spatial_scores(
     candidates: Float[AnyArray, "candidate window dim"],
     config: ModelConfig,
 ) -> Float[Array, "candidate size"]:
-    """Compute the rapid spatial score of each size of windows (paper section 3.4)."""
+    """Compute the rapid spatial score of each window size (paper section 3.4)."""
 
     def of_one(candidate: AnyArray) -> Array:
         matched = [(mutual_matches(query[w], candidate[w]), grid) for w, grid in _parts(config)]
@@ -145,9 +145,9 @@ def _matches_to(
 
 
 def inlier_scores(query: Features, candidates: Features, config: ModelConfig) -> Scores:
-    """Compute the share of windows of each size that RANSAC calls inliers (paper section 3.4).
+    """Compute the share of windows of each size that are RANSAC inliers (paper section 3.4).
 
-    As in the authors' code the homography maps the candidate's windows to the query's.
+    As in the authors' code, the homography maps the candidate's windows to the query's.
     """
     by_size = jax.device_get(_matches_to(query, candidates, config))
     scores = [
@@ -158,7 +158,7 @@ def inlier_scores(query: Features, candidates: Features, config: ModelConfig) ->
 
 
 def _parts(config: ModelConfig) -> list[tuple[slice, Grid]]:
-    """List which windows have each size, and their rows and columns."""
+    """List the slice of windows of each size, and their rows and columns."""
     grids = [grid for _, _, grid in windows_of(config)]
     bounds = itertools.accumulate((rows * columns for rows, columns in grids), initial=0)
     slices = itertools.starmap(slice, itertools.pairwise(bounds))
@@ -171,11 +171,11 @@ def weighted_sum(scores: Scores, config: ModelConfig) -> Scores:
 
 
 def standardised_sum(scores: Scores, config: ModelConfig) -> Scores:
-    """Standardise each size's scores over a query's candidates, then sum them, weighted.
+    """Standardise the scores of each size over a query's candidates, then sum them, weighted.
 
-    The authors' code does so before Eq. 6. A size at which all score the same adds 0.
+    The authors' code does so before Eq. 6. A size at which all scores are equal adds 0.
     """
-    # In float64 the mean of equal float32 numbers is exact, so that their deviation is 0.
+    # In float64, the mean of equal float32 values is exact, so their deviation is 0.
     scores = scores.astype(np.float64)
     deviation = scores.std(axis=0)
     off = scores - scores.mean(axis=0)

@@ -1,4 +1,4 @@
-"""What every second stage does: it scores each pair of images once, and sorts by the scores."""
+"""The base of every second stage: score each pair of images once, and sort by the scores."""
 
 import contextlib
 from collections.abc import Iterable, Sequence
@@ -13,10 +13,10 @@ from crisalad_jax.utils.shapes import Int
 
 
 class SecondStage:
-    """Puts each query's first neighbours in a new order; enter it before use."""
+    """Re-ranks the first neighbours of each query; use it as a context manager."""
 
     def __init__(self, label: str, top: int, reading: Reading) -> None:
-        """Take its name for progress bars, and how many neighbours it puts in order."""
+        """Set the label of progress bars, and the number of neighbours to re-rank."""
         self._label, self._top, self._reading = label, top, reading
         self._scores: dict[tuple[int, int], Any] = {}
 
@@ -25,27 +25,27 @@ class SecondStage:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Release what it holds."""
+        """Release its resources."""
 
     def prepare(self, first: Int[np.ndarray, "query candidate"]) -> None:
-        """Compute what depends on one image only."""
+        """Compute what depends only on single images."""
 
     def compare(self, query: int, candidates: Sequence[int]) -> Iterable[Any]:
-        """Score some candidates of a query, each by itself."""
+        """Score candidates of a query, each independently."""
         raise NotImplementedError
 
     def order(self, scores: np.ndarray, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the new order of a query's candidates, and a score of each, in the old one."""
+        """Return the new order of a query's candidates, and their scores in the old order."""
         raise NotImplementedError
 
     def __call__(self, neighbours: Neighbours) -> Neighbours:
-        """Sort each query's first `top` neighbours by falling score.
+        """Sort the first `top` neighbours of each query by descending score.
 
-        Equal scores keep the first stage's order, and so do the neighbours after the first `top`.
-        Scores replace the similarities of the neighbours that are re-ranked.
+        Ties, and neighbours after the first `top`, stay in the order of the first stage. Scores
+        replace the similarities of the re-ranked neighbours.
 
         Raises:
-            InputError: an image cannot be read; the disk has no room for the features.
+            InputError: an image cannot be read; the disk has no space for the features.
         """
         indices, similarities = (np.array(part) for part in neighbours)
         first = indices[:, : self._top]
@@ -63,5 +63,5 @@ class SecondStage:
         return Neighbours(indices, similarities)
 
     def bar(self, what: str, count: int, unit: str) -> contextlib.AbstractContextManager[Bar]:
-        """Show the progress of a part of its work."""
+        """Show the progress of one part of the work."""
         return progress_bar(f"{self._label}, {what}", count, unit, quiet=self._reading.quiet)

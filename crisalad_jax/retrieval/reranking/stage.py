@@ -1,4 +1,4 @@
-"""The second stage: local features of the retrieved images, computed once, and the new order."""
+"""The second stage: compute local features of retrieved images once, and re-rank by them."""
 
 import dataclasses
 import os
@@ -28,25 +28,25 @@ from crisalad_jax.utils.shapes import Bool, Float, Int
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A second stage's local features, and its scores of pairs of images."""
+    """The local features of a second stage, and its scores of pairs of images."""
 
     aggregator: str | None
-    """Name of the aggregator whose models it takes; None takes any that has what it compares."""
+    """Name of the aggregator that models need; None takes any model with features to compare."""
     shape: Callable[[ModelConfig], tuple[int, int]]
     """Returns the number of an image's features, and their length."""
     describe: Callable[[Crisalad, Any, ModelConfig], Any]
     """Computes the features of a batch of images."""
     score: Callable[..., Any]
-    """Scores any number of a query's candidates, each by itself: one score, or one of each part.
+    """Scores any number of candidates of a query independently: one score, or one for each part.
     It takes the features of the query and of the candidates, and the configuration."""
     fuse: Callable[[np.ndarray, ModelConfig], Float[np.ndarray, " candidate"]] = (
         lambda scores, config: scores
     )
-    """Makes one score of the parts, of all candidates of a query together."""
+    """Combines the scores of parts into one, for all candidates of a query together."""
     dtype: type[np.floating] = np.float16
     """Type of the features in the temporary file."""
     by_params: bool = False
-    """Whether `score` takes the model's parameters, too, and first."""
+    """Whether `score` also takes the model's parameters, as its first argument."""
 
 
 _PATCH_NETVLAD = Method(
@@ -69,7 +69,7 @@ _METHODS: Mapping[str, Method | None] = {
     "selavpr": Method(
         "selavpr", matching.selavpr_shape, matching.describe_selavpr, matching.count_matches
     ),
-    # One feature an image: float32 takes little, and ranks as the authors' code does.
+    # One feature per image: float32 takes little space, and ranks as the authors' code does.
     "selavprpp": Method(
         "selavprpp-hash",
         matching.selavprpp_shape,
@@ -82,17 +82,17 @@ _METHODS: Mapping[str, Method | None] = {
     ),
 }
 RERANKERS = tuple(_METHODS)
-"""Names of the second stages. A method that is None compares local features of no model."""
+"""Names of the second stages. A method that is None needs no model for its local features."""
 _AT_ONCE = 16
-"""Largest number of candidates of a query that are scored together."""
+"""Maximum number of candidates of a query that are scored together."""
 _NUMBERS = 2**25
-"""Largest size of the features that are scored together, in numbers: 64 MiB."""
+"""Maximum number of values in the features that are scored together: 64 MiB."""
 
 
 @with_field_docs
 @dataclasses.dataclass(frozen=True)
 class Reranking:
-    """Which retrievals are re-ranked, by which method, with which model.
+    """Which retrievals to re-rank, by which method, with which model.
 
     Example:
         >>> Reranking("transvpr", 100).label
@@ -100,13 +100,13 @@ class Reranking:
     """
 
     name: str
-    """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, by a model with NetVLAD; fol,
-    pair-vpr, selavpr or transvpr, by one with that aggregator; selavprpp, by one with
-    selavprpp-hash; sinkhorn-divergence, by one with local tokens; local, by SIFT or `matcher`."""
+    """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, with a NetVLAD model; fol,
+    pair-vpr, selavpr or transvpr, with a model of that aggregator; selavprpp, with selavprpp-hash;
+    sinkhorn-divergence, with local tokens; local, with SIFT or `matcher`."""
     top: int
-    """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
+    """Number of first retrievals of a query to re-rank; the later ones keep their places."""
     model: Model | None = None
-    """The model that makes local features; None uses the first stage's."""
+    """The model for the local features; None uses the first stage's."""
     matcher: str | os.PathLike[str] | None = None
     """For local, the ONNX file of `Verify.matcher`; None is SIFT."""
 
@@ -125,15 +125,15 @@ class Reranking:
 
     @property
     def needs_model(self) -> bool:
-        """Whether a model makes the local features."""
+        """Whether a model computes the local features."""
         return _METHODS[self.name] is not None
 
     def check(self, config: ModelConfig, database: int | None = None) -> None:
         """Check that this re-ranking fits a first stage of `config`.
 
         Raises:
-            InputError: the model that makes local features has another aggregator, or its images
-                too few patches; more retrievals than the database has images, if that is given.
+            InputError: the model for local features has another aggregator, or its images have too
+                few patches; `top` is above the number of images in `database`, if that is given.
         """
         method, own = _METHODS[self.name], config if self.model is None else self.model.config
         if method is not None:
@@ -156,7 +156,7 @@ class Reranking:
         queries: Sequence[pathlib.Path],
         reading: Reading = Reading(),
     ) -> SecondStage:
-        """Make the second stage over some images, which is entered before use.
+        """Create the second stage for these images; use it as a context manager.
 
         Raises:
             InputError: what `check` and `open_matcher` raise.
@@ -168,7 +168,7 @@ class Reranking:
 
 
 def parse_reranking(text: str) -> Reranking:
-    """Read NAME:TOPK, as in patch-netvlad:100.
+    """Parse NAME:TOPK, as in patch-netvlad:100.
 
     Raises:
         InputError: the form, the name or the number is wrong.
@@ -188,15 +188,15 @@ class _Side(NamedTuple):
     paths: Sequence[pathlib.Path]
     features: Float[np.ndarray, "image feature dim"]
     known: Bool[np.ndarray, " image"]
-    """Whether the features of an image are there."""
+    """Whether the features of an image are computed."""
 
 
 class Reranker(SecondStage):
-    """Puts the neighbours of any number of first stages over the same images in a new order.
+    """Re-ranks the neighbours of any number of first stages over the same images.
 
-    Local features of the queries and of the retrieved database images are computed once, by
-    `batch_size`. Temporary files hold them, most in float16, and the system caches these in memory
-    as far as there is room; scores of pairs stay in memory. The device scores up to 16 candidates
+    Local features of the queries and of the retrieved database images are computed once, in batches
+    of `batch_size`. Temporary files hold them, mostly in float16, and the system caches these in
+    memory if there is room; scores of pairs stay in memory. The device scores up to 16 candidates
     of a query at a time, in one compiled program.
     """
 
@@ -207,7 +207,7 @@ class Reranker(SecondStage):
         queries: Sequence[pathlib.Path],
         reading: Reading = Reading(),
     ) -> None:
-        """Prepare the second stage, of a re-ranking with a model; enter it before use.
+        """Prepare the second stage of a re-ranking with a model; use it as a context manager.
 
         Raises:
             InputError: no model, or what `Reranking.check` raises.
@@ -244,10 +244,10 @@ class Reranker(SecondStage):
         self._describe(self._database, np.unique(first), "candidates")
 
     def _describe(self, side: _Side, images: Int[np.ndarray, " image"], name: str) -> None:
-        """Compute the features of those images that have none yet.
+        """Compute the features of images that have none yet.
 
         Raises:
-            InputError: an image cannot be read, or the disk has no room.
+            InputError: an image cannot be read, or the disk has no space.
         """
         missing = images[~side.known[images]]
         if not len(missing):
@@ -269,7 +269,7 @@ class Reranker(SecondStage):
                 bar.advance(len(rows))
 
     def compare(self, query: int, candidates: Sequence[int]) -> Iterator[float | list[float]]:
-        """Yield the score of a query and each of some candidates, or one of each part."""
+        """Yield the score of a query with each candidate, or one for each part."""
         patches, dim = self._queries.features.shape[1:]
         step = max(1, min(_AT_ONCE, self._top, _NUMBERS // (patches * dim)))
         given = (self._params,) if self._method.by_params else ()
@@ -283,6 +283,6 @@ class Reranker(SecondStage):
             yield from np.asarray(found)[: len(part)].tolist()
 
     def order(self, scores: np.ndarray, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Put candidates in order by their scores alone, fused where there are several."""
+        """Order candidates only by their scores, fused if there are several."""
         fused = self._method.fuse(scores, self._config).astype(np.float32)
         return np.argsort(-fused, kind="stable"), fused

@@ -1,3 +1,3 @@
-"""A map as a web service: places that photographs show, asked over HTTP or in a browser."""
+"""Serve a map over HTTP and to browsers, to find the places that photographs show."""
 
 from crisalad_jax.retrieval.serve.server import serve_map as serve_map

@@ -1,4 +1,4 @@
-"""The HTTP interface: routes, who may ask, and errors as JSON."""
+"""The HTTP interface: routes, access control, and errors as JSON."""
 
 import asyncio
 import base64
@@ -66,16 +66,16 @@ from crisalad_jax.utils.output import one_line, printable
 from crisalad_jax.utils.version import VERSION
 
 MOST_ANSWERS = 100
-"""Largest k."""
+"""Maximum k."""
 MOST_PIXELS = 2**26
-"""Pixels that a picture may have by default; some phones exceed that in their highest setting."""
+"""Default maximum of pixels in a picture; some phones exceed it at their highest setting."""
 _LANES = ((2**21, 4), (2**24, 1), (math.inf, 1))
-"""Most pixels of a picture, and how many of these are decoded at once: large ones, each of which
-takes seconds, hold up no small ones."""
+"""Maximum pixels of a picture, and how many such pictures are decoded at once: large ones, which
+take seconds each, do not hold up small ones."""
 _THUMBNAILS = 512
-"""Number of thumbnails in memory, some 30 kB each."""
+"""Number of cached thumbnails, about 30 kB each."""
 _DOTS = 4000
-"""Number of places that the page draws at most."""
+"""Maximum number of places that the page draws."""
 FAILED = "the map or the model failed; the service's terminal says why"
 _LOCAL = ("localhost", "127.0.0.1", "[::1]")
 
@@ -84,13 +84,13 @@ PAGE = _FILE.read_text("utf-8").replace("IMAGE_SUFFIXES", ",".join(IMAGE_SUFFIXE
 
 
 def _hash(tag: str) -> str:
-    """Return the digest of the page's script or style, as a policy lists it."""
+    """Return the digest of the page's script or style, for the content security policy."""
     text = PAGE.partition(f"<{tag}>")[2].partition(f"</{tag}>")[0]
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def headers(tiles: Tiles | None = None) -> dict[str, str]:
-    """Return the headers of every answer."""
+    """Return the headers of every response."""
     return {
         # The page holds its style and its script; nothing else runs in it.
         "Content-Security-Policy": (
@@ -100,7 +100,7 @@ def headers(tiles: Tiles | None = None) -> dict[str, str]:
         ),
         "X-Content-Type-Options": "nosniff",
         "X-Frame-Options": "DENY",
-        # OpenStreetMap's servers refuse browsers that do not say whose page wants tiles.
+        # OpenStreetMap's servers refuse browsers that do not send a referrer.
         "Referrer-Policy": "strict-origin" if tiles else "no-referrer",
         "Cross-Origin-Opener-Policy": "same-origin",
         "Cross-Origin-Resource-Policy": "same-origin",
@@ -110,7 +110,7 @@ def headers(tiles: Tiles | None = None) -> dict[str, str]:
 
 @dataclasses.dataclass(frozen=True)
 class Verified:
-    """What local features show of the picture and an answer."""
+    """How well the local features of the picture match an answer."""
 
     inliers: int
     matches: int
@@ -130,9 +130,9 @@ class Neighbour:
     position: dict[str, float] | None
     """east and north, or x and y, in metres, or lat and lon in degrees."""
     number: int
-    """Its picture is at /images/{number}, also after others were removed from the map."""
+    """Its picture is at /images/{number}, even after others are removed from the map."""
     verified: Verified | None = None
-    """Of the first answers, where the service verifies them."""
+    """For the first answers, if the service verifies them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,14 +141,14 @@ class Located:
 
     neighbours: list[Neighbour]
     known: bool | None
-    """Whether the picture shows a place of the map, as far as the map is calibrated; else null."""
+    """Whether the picture shows a place of the map, if the map is calibrated; otherwise null."""
     latency_ms: float
     """From the last byte of the picture to the answer."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Appended:
-    """An image that the map has from now on."""
+    """An image that was appended to the map."""
 
     number: int
     name: str
@@ -160,7 +160,7 @@ class Appended:
 
 @dataclasses.dataclass(frozen=True)
 class Health:
-    """What runs."""
+    """The status of the service."""
 
     status: str
     images: int
@@ -169,7 +169,7 @@ class Health:
     search: str
     """exact, hnsw or ivf-rabitq."""
     stale_search: str | None
-    """An approximate search that lacks images and is not used; build it again. Else null."""
+    """An approximate search that lacks images, unused until it is rebuilt; otherwise null."""
     uptime_s: float
 
 
@@ -182,18 +182,18 @@ class Places:
     axes: tuple[str, str] | None
     zone: str | None
     positions: list[tuple[int, float, float]]
-    """(number, position), evenly chosen where there are many."""
+    """(number, position), evenly sampled if there are many."""
     positions_known: int
     appends: bool
     k: int
     max_bytes: int
     tiles: Tiles | None
-    """What the page draws behind them; null where nothing."""
+    """What the page draws behind them; null for nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """Why a request was not answered."""
+    """Why a request failed."""
 
     error: str
 
@@ -206,13 +206,13 @@ class _Asked(pydantic.BaseModel, extra="forbid"):
     k: int | None = pydantic.Field(None, ge=1, le=MOST_ANSWERS)
     """Number of answers; by default the service's, see /map."""
     verify: int | None = pydantic.Field(None, ge=0, le=MOST_ANSWERS)
-    """Number of best answers that are verified; by default the service's, of --rerank."""
+    """Number of best answers to verify; by default the service's, from --rerank."""
     where: str | None = None
-    """Conditions on the images that are searched, as of `crisalad query --where`."""
+    """Conditions on the images that are searched, as in `crisalad query --where`."""
 
 
 def _plain(text: str) -> str:
-    """Refuse what is no plain number: pydantic too reads 1_0 as 10."""
+    """Refuse text that is not a plain number: pydantic, too, reads 1_0 as 10."""
     if math.isnan(number_of(text)):
         raise PydanticCustomError("number", "expected a number")
     return text
@@ -223,7 +223,7 @@ _Metres = Annotated[_Number, pydantic.Field(ge=-MOST_METRES, le=MOST_METRES)]
 
 
 class _NewImage(pydantic.BaseModel, extra="forbid"):
-    """Where an image was taken is named along one of `AXES`."""
+    """The name of an image, and where it was taken, along one of `AXES`."""
 
     name: str
     east: _Metres = None
@@ -234,7 +234,7 @@ class _NewImage(pydantic.BaseModel, extra="forbid"):
     y: _Metres = None
 
     def position(self) -> Positions | None:
-        """Return the position that was asked for, by default what a name with @UTM says."""
+        """Return the given position, or by default the one in a name with @UTM."""
         given = self.model_dump(exclude={"name"}, exclude_none=True)
         if not given:
             named = utm_positions([self.name])
@@ -279,20 +279,20 @@ def make_app(
     tiles: Tiles | None = None,
     rerank: Verify | None = None,
 ) -> ASGIApp:
-    """Make the application that answers for a map.
+    """Create the application that serves a map.
 
     Args:
-        worker: the map's.
-        host: the name or address that it is served at, which requests name without a token.
-        token: what requests have to bring; None is nothing, from this machine alone.
+        worker: the worker of the map.
+        host: the name or address that it is served at; without a token, requests must name it.
+        token: the token that requests must send; None needs none, and accepts only this machine.
         appends: whether the map is open for appending.
-        map_images: folder of the map's images; None is where they were.
-        k: answers to a picture where the request names no number.
-        max_bytes: largest body of a request.
-        max_pixels: most pixels of a picture that a request brings.
-        most_waiting: number of requests with a picture at once; more are told to come again.
+        map_images: folder of the map's images; None is the original one.
+        k: number of answers to a picture, unless the request gives one.
+        max_bytes: maximum size of a request body.
+        max_pixels: maximum pixels of a picture in a request.
+        most_waiting: maximum number of requests with a picture at once; more should retry later.
         tiles: what the page draws behind the map's places.
-        rerank: how the best answers are verified; None does not.
+        rerank: how to verify the best answers; None does not.
 
     Returns:
         An ASGI application.
@@ -304,12 +304,12 @@ def make_app(
     checking = ThreadPoolExecutor(1, "verify")
     verifier = None if rerank is None else Verifier(rerank)
     thumbnail = functools.lru_cache(_THUMBNAILS)(read_thumbnail)
-    # Of one map, with and without verification: a calibration of inliers is a file.
+    # For one map, with and without verification: a calibration of inliers is a file.
     thresholds = functools.lru_cache(2)(asked_thresholds)
     waiting = asyncio.Semaphore(most_waiting)
 
     async def check_access(request: Request, given: _Bearer) -> None:
-        """With a token whoever brings it may ask; without one no page of another site."""
+        """Require the token if there is one; otherwise refuse pages of other sites."""
         if token is not None:
             brought = "" if given is None else given.credentials
             if not secrets.compare_digest(brought.encode(), token.encode()):
@@ -334,7 +334,7 @@ def make_app(
         version=VERSION,
         docs_url=None,  # FastAPI's page loads scripts from another server
         redoc_url=None,
-        redirect_slashes=False,  # to an address of the client's choice, its Host
+        redirect_slashes=False,  # the address would be the client's Host
         dependencies=[fastapi.Depends(_check_parameters)],
         responses=_PROBLEM,
         exception_handlers=dict.fromkeys((*_CLIENTS, MapFailedError, Exception), _answer_error),
@@ -349,7 +349,7 @@ def make_app(
 
     @app.get("/health")
     async def health(_: _Nothing) -> Health:
-        """Tell that the service runs, of which model, how it searches, and since when."""
+        """Report the status of the service, its model, its search and its uptime."""
         places = worker.places
         if not places.exists:
             raise HTTPException(503, FAILED)
@@ -364,7 +364,7 @@ def make_app(
 
     @guarded.get("/map")
     def describe_map(_: _Nothing) -> Places:
-        """Tell how large the map is, and where its images were taken."""
+        """Return the size of the map, and where its images were taken."""
         places = worker.places
         positions, rows = places.images.positions, places.removed.rows_of(np.arange(len(places)))
         known = rows[~np.isnan(positions[rows, 0])]
@@ -379,7 +379,7 @@ def make_app(
             appends=appends,
             k=k,
             max_bytes=max_bytes,
-            # A map without positions may have got some that no tile has.
+            # A map opened without positions may have got some that tiles cannot show.
             tiles=tiles if places.axes == AXES[1] or places.zone else None,
         )
 
@@ -400,7 +400,7 @@ def make_app(
 
     @guarded.post("/locate", openapi_extra=_BODY)
     async def locate(request: Request, asked: Annotated[_Asked, Query()]) -> Located:
-        """Find the most similar images of the map to a picture."""
+        """Find the images of the map that are most similar to a picture."""
         data, name = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
@@ -435,7 +435,7 @@ def make_app(
 
     @guarded.post("/images", status_code=201, openapi_extra=_BODY)
     async def append(request: Request, asked: Annotated[_NewImage, Query()]) -> Appended:
-        """Append a picture to the map, for good; answers see it from then on."""
+        """Append a picture to the map permanently; answers include it from then on."""
         if not appends:
             raise HTTPException(403, "images: found a map that is only read, expected --append")
         check_new_name(asked.name)
@@ -444,7 +444,7 @@ def make_app(
         async with _room(waiting):
             start = time.perf_counter()
             pixels, places = await prepare(data, asked.name), worker.places
-            # A map in other axes leaves out what EXIF data says, as `crisalad index` does.
+            # A map in other axes ignores the position in EXIF data, as `crisalad index` does.
             if position is None and places.axes in (None, AXES[1]):
                 said = await asyncio.to_thread(exif_position, io.BytesIO(data))
                 position = said and Positions(AXES[1], {asked.name: said})
@@ -455,7 +455,7 @@ def make_app(
         return Appended(row, asked.name, there, len(places), _milliseconds(start))
 
     async def answer(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer who names this service's host, and HEAD as GET: the server leaves out the body."""
+        """Answer requests that name this host, and HEAD as GET: the server leaves out the body."""
         host = Headers(scope=scope).get("host", "")
         if not own_host.fullmatch(host):
             problem = {"error": f"Host: found {host!r}, expected this machine's, or a token"}
@@ -475,33 +475,33 @@ def _row(places: Map, number: int) -> int:
 def _verified(
     verifier: Verifier, image: Any, places: Map, found: list[tuple[int, float]], count: int
 ) -> tuple[list[tuple[int, float]], list[Verification]]:
-    """Verify the first answers, and put them in order."""
+    """Verify the first answers, and reorder them."""
     first = found[:count]
     images, similarities = [places.images[number] for number, _ in first], [s for _, s in first]
     try:
         order, checks, _ = verify_answers(
             verifier, image, images, np.array(similarities, np.float32), places.axes
         )
-    except InputError as error:  # of the map's files, of which clients learn nothing
+    except InputError as error:  # about the map's files, which clients must not see
         raise MapFailedError(str(error)) from error
     return [*(first[i] for i in order), *found[count:]], checks
 
 
 def _check_parameters(request: Request) -> None:
-    """Check that the URL has no parameter twice, of which the last one would count."""
+    """Check that no URL parameter is repeated, since only the last one would count."""
     counts = collections.Counter(name for name, _ in request.query_params.multi_items())
     for name, count in counts.items():
         require(count == 1, f"{name}: found it {count} times, expected it once")
 
 
 def bracketed(host: str) -> str:
-    """Return a host as it is written before a port: an address of IPv6 in brackets."""
+    """Return a host as it is written before a port: an IPv6 address in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 @contextlib.asynccontextmanager
 async def _room(free: asyncio.Semaphore) -> AsyncIterator[None]:
-    """Take a place while the block runs, or refuse the request."""
+    """Hold a slot while the block runs, or refuse the request."""
     if free.locked():
         reason = "found too many requests that wait, try again"
         raise HTTPException(503, reason, {"Retry-After": "1"})
@@ -514,7 +514,7 @@ def _milliseconds(start: float) -> float:
 
 
 _CLIENTS = (HTTPException, RequestValidationError, InputError, ClientDisconnect)
-"""Errors of a client; all others are of the map, the model or this service."""
+"""Errors of a client; all others come from the map, the model or this service."""
 
 
 async def _answer_error(_: Request, error: Exception) -> Response:
@@ -529,7 +529,7 @@ async def _answer_error(_: Request, error: Exception) -> Response:
     elif isinstance(error, NameTakenError):
         status = 409
     elif not isinstance(error, _CLIENTS):
-        # The client learns nothing of the machine; who runs the service sees why.
+        # The client learns nothing about the machine; the operator sees the reason.
         print(f"crisalad: {one_line(error)}", file=sys.stderr, flush=True)
         status, reason = 500, FAILED
     return JSONResponse({"error": one_line(reason)}, status, headers)

@@ -1,4 +1,4 @@
-"""Pictures that requests bring, and small ones of the map's images."""
+"""Receive pictures from requests, and make thumbnails of the map's images."""
 
 import asyncio
 import io
@@ -24,32 +24,32 @@ from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
 
 _PATIENCE = 60.0
-"""Seconds in which a picture has to arrive."""
+"""Seconds within which a picture must arrive."""
 _FIELDS = 10
-"""Most files, and most fields, that are read of a form."""
+"""Maximum number of files, and of fields, that are read from a form."""
 _LONGEST, _LONGEST_PATH = 200, 1000
-"""Most bytes of each part of a new image's name, and of all: file systems take 255 of a part, and
-a temporary file's name is longer."""
+"""Maximum bytes of each part of a new image's name, and of the full name: file systems allow 255
+per part, and the name of a temporary file is longer."""
 _LEVELS = 20
-"""Most parts of a new image's name."""
+"""Maximum number of parts of a new image's name."""
 Image.init()
 _KNOWN = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "GIF", "AVIF", "JPEG2000", "PPM")
 _FORMATS = [each for each in _KNOWN if each in Image.OPEN]
-"""Pillow's names of the formats that are read; OpenCV would decode others too."""
+"""Pillow's names of the accepted formats; OpenCV would decode others too."""
 _PLAIN = ("JPEG", "MPO", "PNG", "WEBP", "BMP", "PPM")
-"""Those that take as long as their head says. Tiles and frames of others have their own sizes."""
+"""Formats whose header gives the size to decode; tiles and frames of others have their own."""
 _MOST_SCANS = 32
-"""Most scans of a JPEG: encoders write some ten, and each takes as long as all of a plain one."""
+"""Maximum scans of a JPEG: encoders write about ten, and each takes as long as a plain JPEG."""
 _SIDE = 480
-"""Largest side of a thumbnail in pixels."""
-Image.MAX_IMAGE_PIXELS = None  # `check_picture` has a limit of its own, and decodes nothing
+"""Longer side of a thumbnail in pixels, at most."""
+Image.MAX_IMAGE_PIXELS = None  # `check_picture` has its own limit, and decodes nothing
 
 
 async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str]:
-    """Receive a picture's file, and its name, in the body or in a form's field `image`.
+    """Receive the file and name of a picture, from the body or the form field `image`.
 
     Raises:
-        HTTPException: it is too large or too slow, or the form is another one.
+        HTTPException: it is too large or too slow, or the form has other fields.
     """
     received = 0
 
@@ -75,22 +75,22 @@ async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str
                         400, f"image: found a form of {names}, expected one file of this name"
                     )
                 return await image.read(), image.filename or "image"
-    except UnicodeError as error:  # of a codec that the form names
+    except UnicodeError as error:  # from a charset that the form names
         raise HTTPException(400, f"image: found a form of another charset: {error}") from error
     except TimeoutError as error:
         raise HTTPException(408, f"image: found half of it after {_PATIENCE:g} s") from error
 
 
 def check_picture(data: bytes, name: str, most_pixels: int) -> float:
-    """Check what a picture's head says before it is decoded; return how many pixels it may take.
+    """Check a picture's header before decoding it; return the maximum number of pixels to decode.
 
     Raises:
-        InputError: it is of another format, too large, or a JPEG of too many scans.
+        InputError: it has another format, is too large, or is a JPEG with too many scans.
     """
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
             pixels, kind = image.width * image.height, image.format
-    except Exception as error:  # of a damaged file any
+    except Exception as error:  # a damaged file may raise any
         found = f"{len(data)} bytes that do not decode" if data else "an empty file"
         expected = f"an image ({' '.join(IMAGE_SUFFIXES)})"
         raise InputError(f"{name}: found {found}, expected {expected}") from error
@@ -107,7 +107,7 @@ def check_new_name(name: str) -> None:
 
     Raises:
         InputError: a part is empty, hidden or too long, there are too many, the name has control
-            characters or was not UTF-8, or it is a frame's of a video or log.
+            characters or was not UTF-8, or it is the name of a frame of a video or log.
 
     Example:
         >>> check_new_name("tuesday/0001.jpg")
@@ -126,10 +126,10 @@ def check_new_name(name: str) -> None:
 
 
 def image_in(places: Map, row: int) -> MapImage:
-    """Return the image of a map in a row of its store, which no change gives to another image.
+    """Return the image of a map in a row of its store; a row is never given to another image.
 
     Raises:
-        InputError: the map has no such image, or no more.
+        InputError: the map does not have such an image, or no longer has it.
     """
     number = int(places.removed.numbers_of(np.array(row)))
     if not 0 <= number < len(places):
@@ -146,13 +146,13 @@ def read_thumbnail(
 
     Args:
         image: the image.
-        folder: the map's.
-        images: folder of the map's images; None is where they were.
+        folder: the folder of the map.
+        images: folder of the map's images; None is the original one.
 
     Raises:
-        InputError: its file is gone, changed or unreadable.
+        InputError: its file is missing, changed or unreadable.
     """
-    # The record of a map keeps its names below a folder.
+    # The record of a map ensures that names stay below a folder.
     folders = [*([] if images is None else [images]), image.root, folder / ADDED]
     paths = (pathlib.Path(folder, image.name) for folder in folders)
     path = next((path for path in paths if size_of(path) == image.bytes), None)

@@ -1,4 +1,4 @@
-"""The server: opens a map, compiles its model, and answers until a signal ends it."""
+"""The server: open a map, compile its model, and answer requests until a signal stops it."""
 
 import asyncio
 import contextlib
@@ -36,14 +36,14 @@ from crisalad_jax.utils.host import most_files
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
-# It would write a line of each form that is not whole.
+# It would log a line for each incomplete form.
 logging.getLogger("python_multipart").setLevel(logging.ERROR)
 _GRACE = 30
-"""Seconds that requests in flight have, after a signal, until they are dropped."""
+"""Seconds after a signal until requests in flight are dropped."""
 _HEAD, _EXCHANGE = 10, 120
-"""Seconds in which the head of a request has to arrive, and all of it and be read its answer."""
+"""Seconds for the head of a request to arrive, and for all of it, and for its answer to be read."""
 _MOST_CONNECTIONS, _ACCEPTED, _QUEUE = 256, 2, 2048
-"""Most connections, those accepted at once, and those that wait for that in the kernel."""
+"""Maximum connections, those accepted at once, and those that wait for that in the kernel."""
 _SHORTEST_TOKEN = 16
 
 
@@ -68,37 +68,37 @@ def serve_map(
     quiet: bool = False,
     ready: Callable[[str, str], object] = lambda address, engine: None,
 ) -> None:
-    """Serve a map over HTTP, with a page for browsers, until a signal ends it.
+    """Serve a map over HTTP, with a page for browsers, until a signal stops it.
 
-    Requests in flight are answered before it ends; then the signal has its usual effect.
+    Requests in flight are answered before it stops; then the signal has its usual effect.
 
     Args:
         folder: the map.
-        weights: the model that made it; None is where it was then.
+        weights: the model that made it; None is the file that was used then.
         engine: "jax", "onnxruntime" or "openvino"; or "auto", the one that `Map.fastest_engine`
             chooses.
-        host: name or address to listen at. Others than this machine's own need a token.
-        port: port to listen at; 0 is any that is free.
-        token: what requests have to bring as `Authorization: Bearer ...`; None is nothing.
-        k: answers to a picture where the request names no number.
-        append: whether requests may add images to the map, which no other process can then.
-        map_images: folder of the map's pictures; None is where they were.
-        max_bytes: largest body of a request.
-        max_pixels: most pixels of a picture that a request brings.
-        batch_size: largest number of pictures described together, each as if it were alone.
-        tiles: address of a street map's tiles, which browsers draw behind the map's places:
+        host: name or address to listen on. Any but this machine's own needs a token.
+        port: port to listen on; 0 picks a free one.
+        token: token that requests must send as `Authorization: Bearer ...`; None needs none.
+        k: number of answers to a picture, unless the request gives one.
+        append: whether requests may add images to the map; no other process can do so then.
+        map_images: folder of the map's pictures; None is the original one.
+        max_bytes: maximum size of a request body.
+        max_pixels: maximum pixels of a picture in a request.
+        batch_size: maximum number of pictures described together, each independently.
+        tiles: address of street map tiles, which browsers draw behind the map's places:
             https://tile.openstreetmap.org/{z}/{x}/{y}.png. None draws none.
-        tiles_attribution: words to show with them; None is what OpenStreetMap asks for, of its own.
-        rerank: how the best answers are verified by local features; None does not.
+        tiles_attribution: text to show with them; None is what OpenStreetMap requires for its own.
+        rerank: how to verify the best answers by local features; None does not.
         verify: whether to compare the map's descriptors with their checksums.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
         ready: called with the service's address and the engine once it answers.
 
     Raises:
-        InputError: a number out of range; an address that is not this machine's or in use; one that
-            others can reach without a token; no such folder; tiles for a map in neither degrees nor
-            a known zone of UTM; another model than the map's, to append by; or what `Map.open`,
-            `Map.fastest_engine`, `Map.load_model` and `open_for_appending` raise.
+        InputError: a number out of range; an address that is not this machine's, is in use, or can
+            be reached by others without a token; a missing folder; tiles for a map in neither
+            degrees nor a known UTM zone; appending with a model other than the map's; or what
+            `Map.open`, `Map.fastest_engine`, `Map.load_model` and `open_for_appending` raise.
 
     Example:
         >>> serve_map("city.map", host="0.0.0.0")
@@ -123,7 +123,7 @@ def serve_map(
             engine = places.fastest_engine(weights)
         places.load_model(weights, engine=engine, verify=verify)
         describer, expected = places.describer(), places.metadata.model
-        if append and describer.digest != expected:  # an int8 program may ask a map, not extend it
+        if append and describer.digest != expected:  # int8 programs may query a map, not extend it
             found = f"model {describer.digest}"
             raise InputError(f"{weights}: found {found}, expected {expected} with append")
         worker = MapWorker(places, describer, batch_size=batch_size)
@@ -140,14 +140,14 @@ def serve_map(
 
 
 class _Connection(H11Protocol):
-    """A connection, which ends where its client keeps the service waiting."""
+    """A connection that is closed if its client keeps the service waiting."""
 
     since = 0.0
-    """When the client began to send its request: at once, or after the last answer."""
+    """When the client's time for its request began: on connecting, or after the last answer."""
 
     @property
     def patience(self) -> float:
-        """Seconds that the client has for what it is to do; endless where the service is to."""
+        """Seconds that the client has for its turn; infinite while it is the service's turn."""
         if self.transport.get_write_buffer_size():
             return _EXCHANGE  # to read the answer
         if self.cycle is None or self.cycle.response_complete:
@@ -155,10 +155,10 @@ class _Connection(H11Protocol):
         return _EXCHANGE if self.cycle.more_body else math.inf
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take a connection in place of the one that has kept the service waiting for longest."""
+        """Accept a connection; if there are too many, close the one that has stalled longest."""
         super().connection_made(transport)
         self.since = self.loop.time()
-        # The map, pictures and connections on their way need some of the other half.
+        # The map, pictures and incoming connections need some of the other half.
         most = min(most_files() // 2, _MOST_CONNECTIONS)
         connections: set[Any] = self.connections
         if len(connections) > most:
@@ -174,7 +174,7 @@ class _Connection(H11Protocol):
         super().on_response_complete()
 
     def send_400_response(self, msg: str) -> None:
-        """Answer what is not HTTP as all other errors, where an answer has not begun."""
+        """Answer invalid HTTP like all other errors, unless an answer has begun."""
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
             answer = JSONResponse({"error": msg}, 400, {"Connection": "close"})
             headers = [*self.server_state.default_headers, *answer.raw_headers]
@@ -190,7 +190,7 @@ class _Connection(H11Protocol):
 
 
 class Server(uvicorn.Server):
-    """A server of HTTP that ends at a deferred signal."""
+    """An HTTP server that stops on a deferred signal."""
 
     def __init__(
         self,
@@ -199,14 +199,14 @@ class Server(uvicorn.Server):
         ready: Callable[[], object],
         tiles: Tiles | None = None,
     ) -> None:
-        """Take the application, the signals, what to call once it answers, and the page's tiles."""
+        """Set the application, the signals, what to call once it answers, and the page's tiles."""
         config = uvicorn.Config(
             app,
             loop="asyncio",  # uvloop would take the signals that `defer_signals` handles
             http=_Connection,
             ws="none",
             lifespan="off",
-            log_level="error",  # a warning of each request that is not HTTP would fill a disk
+            log_level="error",  # a warning for each invalid request would fill a disk
             backlog=_ACCEPTED,
             access_log=False,
             server_header=False,
@@ -225,13 +225,13 @@ class Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, and call `ready`."""
         await super().startup(sockets)
-        # uvicorn has one number for both; accepted at once, as many would take all descriptors.
+        # uvicorn has one number for both; accepting that many at once would use all descriptors.
         for listener in sockets or ():
             listener.listen(_QUEUE)
         self._ready()
 
     async def on_tick(self, counter: int) -> bool:
-        """Look for a signal and for clients that are too slow, ten times a second."""
+        """Check for a signal and for clients that are too slow, ten times a second."""
         now = asyncio.get_running_loop().time()
         connections: tuple[Any, ...] = tuple(self.server_state.connections)
         for each in connections:
@@ -242,7 +242,7 @@ class Server(uvicorn.Server):
 
 @contextlib.contextmanager
 def _opened(folder: str | os.PathLike[str], *, append: bool, verify: bool) -> Iterator[Map]:
-    """Open a map that is there, to search it, or to append too."""
+    """Open an existing map for searching, or also for appending."""
     with Map.open(folder, verify=verify) as places:
         if not append:
             yield places
@@ -254,7 +254,7 @@ def _opened(folder: str | os.PathLike[str], *, append: bool, verify: bool) -> It
 
 
 def _check_access(host: str, token: str | None) -> None:
-    """Check that what other machines can reach has a token, which is hard to guess."""
+    """Check that a service that other machines can reach has a token that is hard to guess."""
     if token is not None:
         if len(token) < _SHORTEST_TOKEN or not all("!" <= letter <= "~" for letter in token):
             raise InputError(
@@ -269,7 +269,7 @@ def _check_access(host: str, token: str | None) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a name or an address is this machine's own, which no other can reach."""
+    """Return whether a name or address is this machine's own, which others cannot reach."""
     try:
         return host.lower() == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

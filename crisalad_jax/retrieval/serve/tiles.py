@@ -1,4 +1,4 @@
-"""Tiles of a street map behind the page's map of places, from a server that the user names."""
+"""Street map tiles behind the page's map of places, from a server that the user names."""
 
 import dataclasses
 import re
@@ -16,9 +16,9 @@ class Tiles:
     """Where a browser gets tiles from: squares of 256 pixels in Web Mercator."""
 
     url: str
-    """Address with {z}, {x} and {y} in the place of a tile's zoom, column and row."""
+    """Address with {z}, {x} and {y} for the zoom, column and row of a tile."""
     attribution: str
-    """Words that the page shows with them."""
+    """Text that the page shows with them."""
 
     @property
     def origin(self) -> str:
@@ -27,17 +27,17 @@ class Tiles:
 
 
 def open_tiles(url: str, attribution: str | None, places: Map) -> Tiles:
-    """Check the address of tiles, and that a map has positions that are drawn on them.
+    """Check the address of tiles, and that the positions of a map can be drawn on them.
 
     Args:
         url: the address.
-        attribution: words to show with them; None is what OpenStreetMap asks for, and nothing where
-            the tiles are of others.
+        attribution: text to show with them; None is what OpenStreetMap requires for its own tiles,
+            and nothing for others.
         places: the map.
 
     Raises:
-        InputError: no such address; or positions that are neither degrees nor metres of a known
-            zone of UTM.
+        InputError: not an address of tiles; or positions that are neither degrees nor metres of a
+            known UTM zone.
     """
     if not _ADDRESS.fullmatch(url) or any(url.count(f"{{{axis}}}") != 1 for axis in "xyz"):
         raise InputError(

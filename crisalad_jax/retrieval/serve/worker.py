@@ -1,7 +1,7 @@
 """The one thread that owns an open map and its model: it describes, appends and searches.
 
-Nothing else searches or appends, so that every search sees a whole map. What other processes change
-is seen from the next batch on.
+Nothing else searches or appends, so every search sees a consistent map. Changes by other processes
+are visible from the next batch on.
 """
 
 import collections
@@ -27,9 +27,9 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.temporaries import made_folder
 
 ADDED = "added"
-"""Folder in the map's own of the images that requests added."""
+"""Subfolder of the map for images that requests added."""
 _LONGEST_FILE = 3800
-"""Most bytes of a file's whole path. Linux takes 4,095; a temporary file's name is longer."""
+"""Maximum bytes of a full path. Linux allows 4,095; the name of a temporary file is longer."""
 
 
 class NameTakenError(InputError):
@@ -47,7 +47,7 @@ class Question(NamedTuple):
     """As `prepare_image` returns them."""
     k: int
     where: Where | None = None
-    """Which images of the map are searched; None is all."""
+    """Which images of the map to search; None is all."""
 
 
 class Addition(NamedTuple):
@@ -67,9 +67,9 @@ class MapWorker:
         """Take the map, open for appending if images will be added, and the model that made it.
 
         Args:
-            places: the map, which the thread owns until the end.
+            places: the map, which the thread owns until it is closed.
             describer: its model.
-            batch_size: largest number of images described together.
+            batch_size: maximum number of images described together.
         """
         self.places, self._describer, self._batch_size = places, describer, batch_size
         # Each size is a program to compile before the first answer, so there are few.
@@ -86,7 +86,7 @@ class MapWorker:
         """Compile the programs that describe one, a few and `batch_size` images, and search once.
 
         Raises:
-            InputError: the store is damaged or gone.
+            InputError: the store is damaged or missing.
         """
         config = self.places.config
         blank = prepare_image(np.zeros((*config.image_size, 3), np.uint8), config)
@@ -100,10 +100,10 @@ class MapWorker:
         """Queue work.
 
         Returns:
-            Of a question, the map that was searched, and (number, similarity) of its k most similar
-            images; of an addition, its number. It raises `InputError` for conditions that no image
-            meets and for an addition that the map does not take, `NameTakenError` among them, and
-            `MapFailedError` for all else.
+            For a question, the map that was searched, and (number, similarity) of its k most
+            similar images; for an addition, its number. It raises `InputError` for conditions that
+            no image meets and for an addition that the map refuses, including `NameTakenError`, and
+            `MapFailedError` for everything else.
         """
         result: Future[Any] = Future()
         self._waiting.append((work, result))
@@ -111,7 +111,7 @@ class MapWorker:
         return result
 
     def _work(self) -> None:
-        """Do a batch of the work that waits; an earlier call may have left nothing."""
+        """Process a batch of queued work; an earlier call may have left nothing."""
         count = min(len(self._waiting), self._batch_size)
         taken = [self._waiting.popleft() for _ in range(count)]
         batch = [each for each in taken if each[1].set_running_or_notify_cancel()]
@@ -121,7 +121,7 @@ class MapWorker:
             self.places = self.places.refreshed()
             descriptors = self._describe([work.pixels for work, _ in batch])
             jobs = [_Job(*each, row) for each, row in zip(batch, descriptors, strict=True)]
-            # Additions first: an answer sees what came in with its question.
+            # Additions first: an answer includes what arrived with its question.
             self._append([job for job in jobs if isinstance(job.work, Addition)])
             self._search([job for job in jobs if isinstance(job.work, Question)])
         except Exception as error:
@@ -138,7 +138,7 @@ class MapWorker:
         return self.places.shorten(described)[: len(images)]
 
     def _append(self, jobs: "Sequence[_Job]") -> None:
-        """Append images at once, and one by one where that fails: a bad one fails alone."""
+        """Append images at once, or one by one if that fails, so that only a bad one fails."""
         if not jobs:
             return
         first = len(self.places)
@@ -155,7 +155,7 @@ class MapWorker:
             job.result.set_result(number)
 
     def _commit(self, works: Sequence[Addition], descriptors: Float32[np.ndarray, "n d"]) -> None:
-        """Write the files of images, and append these to the map: all of them, or none."""
+        """Write the files of images, and append the images to the map: all of them, or none."""
         places, root = cast(AppendableMap, self.places), self.places.folder / ADDED
         for work in works:
             self._check_name(work.name)
@@ -183,7 +183,7 @@ class MapWorker:
             raise MapFailedError(str(error)) from error
 
     def _check_name(self, name: str) -> None:
-        """Raise `NameTakenError` for an image of the map, or a name that crosses another's path."""
+        """Raise `NameTakenError` if the name is in the map or conflicts with another's path."""
         path = self.places.folder / ADDED / name
         if len(os.fsencode(path.absolute())) > _LONGEST_FILE:
             raise InputError(f"name: found {len(name.encode())} bytes, expected fewer in this map")
@@ -211,7 +211,7 @@ class MapWorker:
 
 
 class _Job(NamedTuple):
-    """A piece of work in hand."""
+    """A piece of work in progress."""
 
     work: Any
     result: "Future[Any]"

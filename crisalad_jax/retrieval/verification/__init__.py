@@ -1,1 +1,1 @@
-"""Verification of answers: matched local features, their inliers, and the pose that they show."""
+"""Verify answers by local features: their matches, inliers, and the camera pose they imply."""

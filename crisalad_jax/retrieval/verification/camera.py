@@ -31,7 +31,7 @@ _EXPECTED = (
 class Intrinsics:
     """A pinhole camera, with its lens distortion and the size of its images if these are known.
 
-    Images of another size are taken as scaled if they have the same aspect.
+    Images of another size are treated as scaled if they have the same aspect.
 
     Example:
         >>> Intrinsics.parse("400,400,320,240,640,480").width
@@ -64,10 +64,10 @@ class Intrinsics:
 
     @classmethod
     def parse(cls, text: str | os.PathLike[str]) -> Self:
-        """Read intrinsics from fx,fy,cx,cy or fx,fy,cx,cy,width,height, or from a camera's file.
+        """Read intrinsics from fx,fy,cx,cy or fx,fy,cx,cy,width,height, or from a camera file.
 
         Args:
-            text: these numbers, or a YAML or JSON file: ROS's camera_info (of camera_calibration,
+            text: these numbers, or a YAML or JSON file: ROS's camera_info (from camera_calibration,
                 or printed by `ros2 topic echo --once`), or the numbers by name.
 
         Raises:
@@ -98,12 +98,12 @@ class Intrinsics:
     def directions(
         self, points: Float64[np.ndarray, "n 2"], size: tuple[int, int], name: str
     ) -> Float64[np.ndarray, "n 2"]:
-        """Turn pixels of an image into x / z and y / z in the camera's axes, undistorted.
+        """Convert pixels of an image to undistorted x / z and y / z in the camera's axes.
 
         Args:
             points: x and y in pixels of the image.
             size: the image's height and width.
-            name: the image's, for messages.
+            name: name of the image, for messages.
 
         Raises:
             InputError: the camera's images have another aspect, or its principal point is not in
@@ -135,7 +135,7 @@ class Intrinsics:
 
 
 def _fields(content: Any) -> tuple[Any, ...]:
-    """Read the fields of `Intrinsics` from what a file says, by ROS's names or ours."""
+    """Read the fields of `Intrinsics` from the content of a file, by ROS's names or ours."""
     if not isinstance(content, Mapping):
         raise TypeError(f"{type(content).__name__} in place of names and numbers")
     model = content.get("distortion_model", "")
@@ -152,6 +152,6 @@ def _fields(content: Any) -> tuple[Any, ...]:
 
 
 def _data(content: Mapping[str, Any], *names: str) -> Any:
-    """Return the numbers under the first of some names that is there; None without any."""
+    """Return the numbers under the first of `names` that exists; None if none does."""
     found = next((content[name] for name in names if name in content), None)
     return found["data"] if isinstance(found, Mapping) else found

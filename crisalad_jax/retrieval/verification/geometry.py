@@ -1,7 +1,7 @@
-"""Two-view geometry of matched points: inliers, relative pose, pose from depth, and on a map.
+"""Two-view geometry of matched points: inliers, relative pose, pose from depth, pose on a map.
 
 Directions of points are x / z and y / z in the axes of their camera, as `Intrinsics.directions`
-returns them. A pose (rotation, translation) turns the first camera's coordinates to the second's.
+returns them. A pose (rotation, translation) maps the first camera's coordinates to the second's.
 """
 
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ from crisalad_jax.utils.shapes import Bool, Float64, Int64
 
 Points = Float64[np.ndarray, "n 2"]
 LEAST = 8
-"""Fewest matches that an epipolar geometry, and fewest inliers that a pose, is computed from."""
+"""Minimum number of matches for an epipolar geometry, and of inliers for a pose."""
 _SURE, _TRIALS = 0.9999, 10_000
-"""Probability of a sample without outliers at which RANSAC ends, and its most samples."""
+"""Probability of an outlier-free sample at which RANSAC stops, and its sample limit."""
 
 
 class Pose(NamedTuple):
@@ -33,12 +33,12 @@ class Pose(NamedTuple):
 
 
 def epipolar_inliers(first: Points, second: Points, distance: float) -> Bool[np.ndarray, " n"]:
-    """Find the matches that one fundamental matrix explains, by MAGSAC++ from a fixed seed.
+    """Find the matches that one fundamental matrix explains, by MAGSAC++ with a fixed seed.
 
     Args:
         first: pixels in one image.
         second: the same points in the other.
-        distance: largest distance from an epipolar line, in pixels.
+        distance: maximum distance from an epipolar line, in pixels.
     """
     none = np.zeros(len(first), bool)
     if len(first) < LEAST:
@@ -53,12 +53,12 @@ def epipolar_inliers(first: Points, second: Points, distance: float) -> Bool[np.
 def rotation_only(
     first: Points, second: Points, distance: float
 ) -> Float64[np.ndarray, "3 3"] | None:
-    """Compute the rotation between cameras in one place (Kabsch 1976); None if they moved apart.
+    """Compute the rotation between cameras at one place (Kabsch 1976); None if they moved apart.
 
     Args:
         first: directions of points from the first camera.
         second: from the second.
-        distance: largest distance of a point, which nine in ten have to keep.
+        distance: maximum distance of a point after rotation, which nine in ten must meet.
     """
     if len(first) < LEAST:
         return None
@@ -71,12 +71,12 @@ def rotation_only(
 
 
 def relative_pose(first: Points, second: Points, distance: float) -> Pose | None:
-    """Compute the pose between two cameras, with a translation of length 1; None without enough.
+    """Compute the pose between two cameras, with a unit translation; None with too few inliers.
 
     Args:
         first: directions of points from the first camera.
         second: from the second.
-        distance: largest distance from an epipolar line.
+        distance: maximum distance from an epipolar line.
     """
     if len(first) < LEAST:
         return None
@@ -96,7 +96,7 @@ def relative_pose(first: Points, second: Points, distance: float) -> Pose | None
 def pose_from_points(
     points: Float64[np.ndarray, "n 3"], directions: Points, distance: float
 ) -> Pose | None:
-    """Compute the pose from points in metres to the camera that sees them (PnP); None without."""
+    """Compute the pose of the camera that sees points in metres (PnP); None if not found."""
     if len(points) < LEAST:
         return None
     eye = np.eye(3)
@@ -117,9 +117,9 @@ def pose_from_points(
 
 
 def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarray, "n 3"]:
-    """Compute points in the second camera's axes from their directions from two cameras.
+    """Triangulate points, in the second camera's axes, from their directions from two cameras.
 
-    Those behind a camera are NaN.
+    Points behind a camera are NaN.
     """
     to_first = np.column_stack(pose.inverse)
     found = cv2.triangulatePoints(np.eye(3, 4), to_first, second.T, first.T)
@@ -129,7 +129,7 @@ def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarra
 
 
 def common_points(first: Points, second: Points) -> tuple[Int64[np.ndarray, " m"], ...]:
-    """Return the rows of two lists of the same image's keypoints that hold the same ones."""
+    """Return the rows of two keypoint lists of one image that hold the same keypoints."""
     rows = {tuple(point): row for row, point in enumerate(first.tolist())}
     points = map(tuple, second.tolist())
     pairs = [(rows[point], row) for row, point in enumerate(points) if point in rows]
@@ -142,11 +142,11 @@ def pose_on_map(
     here: Sequence[float],
     there: Sequence[float],
 ) -> MapPose:
-    """Place a camera on a map, from an answer and the way from it to another; all are level.
+    """Place a camera on a map, from an answer and the vector to another; all are level.
 
     Args:
         pose: from the camera to the answer's, in metres.
-        other: the way to the other answer's camera, in the answer camera's axes, of any length.
+        other: vector to the other answer's camera, in the answer camera's axes, of any length.
         here: the answer's position in metres east and north.
         there: the other's.
     """

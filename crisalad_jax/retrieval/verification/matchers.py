@@ -1,4 +1,4 @@
-"""Matchers: points of one image and the points of another that look the same."""
+"""Matchers: find points that look the same in two images."""
 
 import functools
 import os
@@ -19,15 +19,15 @@ from crisalad_jax.utils.shapes import Float32, Float64, UInt8
 Image = UInt8[np.ndarray, "h w 3"]
 Points = Float64[np.ndarray, "n 2"]
 SIDE = 640
-"""Longer side in pixels at which SIFT sees images; smaller ones are enlarged, at most twice."""
+"""Longer side in pixels of images for SIFT; smaller ones are enlarged, at most twofold."""
 _FEATURES = 1024
-"""Most SIFT features of an image."""
+"""Maximum number of SIFT features per image."""
 _CONTRAST = 0.02
-"""SIFT's least contrast, half of OpenCV's default: thumbnails have few features above that."""
+"""SIFT's contrast threshold, half of OpenCV's default: thumbnails have few features above that."""
 _RATIO = 0.8
-"""Largest distance of a match by that of the second nearest (Lowe, IJCV 2004, section 7.1)."""
+"""Maximum ratio of a match's distance to the second nearest (Lowe, IJCV 2004, section 7.1)."""
 _FREE_SIDES = 512, 512
-"""Height and width for a program that takes any; programs ask for multiples of 8, 16 or 32."""
+"""Height and width for a program that accepts any; programs require multiples of 8, 16 or 32."""
 _CONTRACT = (
     "one input (2, 1 or 3, height, width) of floats, and outputs keypoints, matches and mscores, "
     "as LightGlue-ONNX exports them"
@@ -46,10 +46,10 @@ class SiftMatcher:
     """SIFT features (Lowe, IJCV 2004) as RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
 
     name: str = "sift"
-    """Which matcher: inliers of another one are not comparable."""
+    """Name of the matcher; inliers of different matchers are not comparable."""
 
     def prepare(self, image: Image) -> SiftFeatures:
-        """Find an image's features, which depend on no other image."""
+        """Compute the features of an image, independently of other images."""
         factor = min(2.0, SIDE / max(image.shape))
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
@@ -63,7 +63,7 @@ class SiftMatcher:
         return SiftFeatures((points + 0.5) / factor - 0.5, np.sqrt(rows / sums, dtype=np.float32))
 
     def match(self, query: SiftFeatures, database: SiftFeatures) -> tuple[Points, Points]:
-        """Match features that are each other's nearest, and much nearer than the second.
+        """Match mutual nearest neighbours that are much nearer than the second nearest.
 
         Returns:
             Pixels (x, y) in each image, row by row.
@@ -81,11 +81,11 @@ class SiftMatcher:
 
 
 class OnnxMatcher:
-    """A matcher with its features in one ONNX program, such as ALIKED or SuperPoint + LightGlue.
+    """A matcher and its features in one ONNX program, such as ALIKED or SuperPoint + LightGlue.
 
     The contract is that of LightGlue-ONNX (github.com/fabio-sim/LightGlue-ONNX): `images` are both
     images (2, channels, height, width) from 0 to 1, RGB or grey. `keypoints` (2, n, 2) are x and y
-    in these pixels, `matches` (m, 3) the number of the pair, 0, and a keypoint of each image.
+    in these pixels, `matches` (m, 3) the index of the pair, 0, and a keypoint of each image.
     """
 
     def __init__(self, file: pathlib.Path) -> None:
@@ -105,7 +105,7 @@ class OnnxMatcher:
             session = onnxruntime.InferenceSession(
                 file, options, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # onnxruntime's errors are of many classes
+        except Exception as error:  # onnxruntime raises errors of many classes
             raise InputError(f"{file}: onnxruntime cannot load it: {one_line(error)}") from error
         inputs, outputs = session.get_inputs(), [each.name for each in session.get_outputs()]
         shape = inputs[0].shape if inputs else []
@@ -131,7 +131,7 @@ class OnnxMatcher:
         self.name = f"onnx {sha256_of(file)}"
 
     def prepare(self, image: Image) -> tuple[np.ndarray, np.ndarray]:
-        """Resize an image to the program's size, and return how many times it was larger."""
+        """Resize an image to the program's size, and return it with its reduction factors."""
         height, width = self._sides
         resized = resize_image(image, (height, width), filter="area")
         if self._channels == 1:
@@ -149,7 +149,7 @@ class OnnxMatcher:
                 (points[numbers].astype(np.float64) + 0.5) * factors - 0.5
                 for points, numbers, factors in pairs
             ]
-        except Exception as error:  # of a program that says other shapes than it has
+        except Exception as error:  # the program declares wrong shapes
             raise InputError(
                 f"{self._file}: found {one_line(error)}, expected {_CONTRACT}"
             ) from error
@@ -161,9 +161,9 @@ Matcher = SiftMatcher | OnnxMatcher
 
 
 def open_matcher(file: str | os.PathLike[str] | None) -> Matcher:
-    """Open the matcher of a file ONNX, by default SIFT.
+    """Open the matcher in an ONNX file; the default is SIFT.
 
     Raises:
-        InputError: there is no such file, or it is a program of another kind.
+        InputError: the file does not exist, or is a program of another kind.
     """
     return SiftMatcher() if file is None else OnnxMatcher(pathlib.Path(file))

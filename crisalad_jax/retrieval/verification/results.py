@@ -1,4 +1,4 @@
-"""What verification finds: the inliers of a query and an answer, and where the camera was."""
+"""Results of verification: the inliers of a query and an answer, and the pose of the camera."""
 
 from typing import Any, NamedTuple
 
@@ -11,9 +11,9 @@ from crisalad_jax.utils.shapes import Float64
 
 @brief
 class Verification(NamedTuple):
-    """What matched local features show of a query and one answer.
+    """The matched local features of a query and one answer, and the pose that they imply.
 
-    Cameras have OpenCV's axes: x to the right, y down, z ahead.
+    Cameras use OpenCV's axes: x to the right, y down, z ahead.
     """
 
     inliers: int
@@ -21,24 +21,24 @@ class Verification(NamedTuple):
     matches: int
     """Number of matches of local features."""
     confidence: float
-    """inliers / (8 + 0.3 matches), at most 1: at 1 Brown and Lowe (IJCV 2007, section 3.2) take two
-    images for views of one scene."""
+    """inliers / (8 + 0.3 matches), at most 1: at 1, Brown and Lowe (IJCV 2007, section 3.2) accept
+    two images as views of one scene."""
     query_points: Float64[np.ndarray, "inlier 2"]
     """Pixels of the inliers in the query's file, x and y."""
     database_points: Float64[np.ndarray, "inlier 2"]
     """The same points in the answer's file."""
     rotation: Float64[np.ndarray, "3 3"] | None = None
-    """Turns vectors from the query camera's axes to the answer camera's; None without intrinsics,
+    """Rotates vectors from the query camera's axes to the answer camera's; None without intrinsics,
     or at a confidence below 1."""
     direction: Float64[np.ndarray, " 3"] | None = None
-    """Unit vector to the query's camera, in the answer camera's axes; None as `rotation`, and where
-    both were in one place."""
+    """Unit vector to the query's camera, in the answer camera's axes; None like `rotation`, and if
+    both cameras were at one place."""
     translation: Float64[np.ndarray, " 3"] | None = None
     """Metres from the answer's camera to the query's, in the answer camera's axes; None without
-    depth, or without a second answer whose distance is known."""
+    depth or a second answer at a known distance."""
 
     def fields(self) -> dict[str, Any]:
-        """Return what JSON has of it: not the points, and a quaternion (x, y, z, w)."""
+        """Return the fields for JSON: without the points, and with a quaternion (x, y, z, w)."""
         fields: dict[str, Any] = {"inliers": self.inliers, "matches": self.matches}
         fields["confidence"] = round(self.confidence, 4)
         if self.rotation is not None:
@@ -56,9 +56,9 @@ class Verification(NamedTuple):
 
 @brief
 class MapPose(NamedTuple):
-    """Where the camera of a query was on the map, from two answers with positions."""
+    """The pose of a query's camera on the map, from two answers with positions."""
 
     position: tuple[float, float]
     """In the map's axes."""
     heading: float
-    """Degrees clockwise from north (the second axis, y; of degrees, latitude) to where it looks."""
+    """View direction in degrees clockwise from north (the second axis: y, or latitude)."""

@@ -1,4 +1,4 @@
-"""Verification of a query's answers: how it is done, and what it finds."""
+"""Verify the answers to a query by local features, and locate its camera."""
 
 import dataclasses
 import functools
@@ -35,22 +35,22 @@ from crisalad_jax.utils.shapes import Float, Float64, Int, Int64
 
 _Points = Float64[np.ndarray, "n 2"]
 _DISTANCE = 3.0
-"""Largest distance of an inlier from its epipolar line, in pixels; of larger images than `SIDE`, in
-those of the reduced image."""
+"""Maximum distance of an inlier from its epipolar line, in pixels; for images larger than `SIDE`,
+in pixels of the reduced image."""
 _POSE_DISTANCE = 1.5
 """The same for poses, which need more precise points."""
 _INLIER, _MOST_INLIERS = 0.002, 50
-"""Similarity that an inlier counts as, and how many of them count."""
+"""Similarity that an inlier counts as, and the maximum number that count."""
 _CACHED = 256
-"""Number of the map's images whose features stay in memory, some 0.5 MB each."""
+"""Number of images of the map whose features are cached, about 0.5 MB each."""
 _BASELINE = 0.3
-"""Least metres between two answers that say how far away things are."""
+"""Minimum distance in metres between two answers that locate a camera."""
 
 
 @with_field_docs
 @dataclasses.dataclass(frozen=True)
 class Verify:
-    """How answers are verified by local features.
+    """How to verify answers by local features.
 
     Example:
         >>> Verify(answers=20).answers
@@ -58,25 +58,24 @@ class Verify:
     """
 
     answers: int = 10
-    """Number of each query's best answers that are verified and put in order again, see
-    `order_by_inliers`."""
+    """Number of best answers per query to verify and reorder, see `order_by_inliers`."""
     matcher: str | os.PathLike[str] | None = None
     """ONNX file of a matcher, see `OnnxMatcher`; None is SIFT."""
     intrinsics: Intrinsics | None = None
-    """Of the camera that took the queries, for rotations and directions; None gives inliers."""
+    """Of the camera of the queries, for rotations and directions; None gives only inliers."""
     map_intrinsics: Intrinsics | None = None
-    """Of the camera that took the map's images; None is that of the queries."""
+    """Of the camera of the map's images; None is that of the queries."""
     map_images: str | os.PathLike[str] | None = None
-    """Folder of the map's images; None is where they were."""
+    """Folder of the map's images; None is the original one."""
     map_depth: str | os.PathLike[str] | None = None
-    """Folder of the depth of the map's images: PNGs of 16 bits in millimetres under the images'
-    names, 0 where it is unknown. Answers with depth have a translation in metres."""
+    """Folder of depth for the map's images: 16-bit PNGs in millimetres under the images' names,
+    0 where unknown. Answers with depth have a translation in metres."""
     min_inliers: int | None = None
     """A query whose best answer has fewer is of an unknown place; None is what `calibrate`
-    measured, and any where it did not."""
+    measured, or no limit without that."""
 
     def __post_init__(self) -> None:
-        """Check the number, and that files are there."""
+        """Check the numbers, and that the folders exist."""
         check_count("verify", self.answers)
         require(
             self.intrinsics is not None or (self.map_intrinsics, self.map_depth) == (None, None),
@@ -99,12 +98,12 @@ class _View(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """Pixels of a distance for one of the image: thumbnails have no finer ones than theirs."""
+        """Scale from pixels of the image to pixels of distances; thumbnails are not enlarged."""
         return min(1.0, SIDE / max(self.size))
 
 
 class Verifier:
-    """Matches queries with images of a map; features of the latter are cached."""
+    """Matches queries with images of a map, and caches the features of the latter."""
 
     def __init__(self, verify: Verify) -> None:
         """Open the matcher.
@@ -114,7 +113,7 @@ class Verifier:
         """
         self.verify = verify
         self._matcher = open_matcher(verify.matcher)
-        self._camera: Any = verify.intrinsics  # of both sides there is one, or of none
+        self._camera: Any = verify.intrinsics  # both sides have one, or neither
         self._map_camera: Any = verify.map_intrinsics or verify.intrinsics
         self._read = functools.lru_cache(_CACHED)(
             lambda file, _: self._view(read_image(file, bit_depth="contrast-stretch"), str(file))
@@ -122,22 +121,22 @@ class Verifier:
 
     @property
     def name(self) -> str:
-        """Which matcher: inliers of another one are not comparable."""
+        """Name of the matcher; inliers of different matchers are not comparable."""
         return self._matcher.name
 
     def check(self, image: np.ndarray, names: Sequence[tuple[str, str]]) -> list[Verification]:
-        """Verify answers.
+        """Verify the answers to a query.
 
         Args:
             image: the query, of any type that `as_rgb` takes.
             names: folder and name of the answers' images.
 
         Returns:
-            The verification of each; without matches where its image cannot be read.
+            The verification of each; without matches if its image cannot be read.
 
         Raises:
-            InputError: none of them can be read, intrinsics of another image size, or depth that is
-                not of this kind.
+            InputError: none of them can be read, intrinsics for another image size, or depth in
+                another format.
         """
         query = self._view(as_rgb(image, "contrast-stretch"), "the query")
         checks, lost = [], []
@@ -163,21 +162,20 @@ class Verifier:
         positions: Sequence[Any],
         size: tuple[int, int],
     ) -> tuple[MapPose, int, Float64[np.ndarray, " 3"]] | None:
-        """Compute where the query's camera was from the first two answers that say so.
+        """Compute where the query's camera was, from the first two answers that allow it.
 
-        With depth, these are two answers with a translation. Otherwise matches of the two answers,
-        whose distance is known, say how far away things are, and PnP says where the query's camera
-        was.
+        With depth, these are two answers with a translation. Otherwise, matches between two answers
+        at a known distance give the depth of points, and PnP gives the pose of the query's camera.
 
         Args:
             checks: from `check`.
             names: as `check` takes them.
-            positions: of the answers, two metres east and north; None where unknown.
+            positions: of the answers, in metres east and north; None where unknown.
             size: height and width of the query.
 
         Returns:
-            The pose in metres east and north, the number of the answer that it was computed from,
-            and the metres from that answer's camera, as `Verification.translation`.
+            The pose in metres east and north, the index of the answer that it was computed from,
+            and the metres from that answer's camera, as in `Verification.translation`.
         """
         pairs = enumerate(zip(checks, positions, strict=True))
         known = [n for n, (check, at) in pairs if check.rotation is not None and at is not None]
@@ -203,7 +201,7 @@ class Verifier:
         metres: float,
         size: tuple[int, int],
     ) -> tuple[Pose, np.ndarray] | None:
-        """Compute the query's pose in the first answer's axes, and the way to the second answer."""
+        """Compute the query's pose in the first answer's axes, and the vector to the second."""
         here, there = self._seen(*first), self._seen(*second)
         *_, theirs, ours = self._inliers(there, here)
         rays = self._rays(self._map_camera, there, theirs)
@@ -221,7 +219,7 @@ class Verifier:
         return None if found is None else (found.inverse, pose.translation)
 
     def _seen(self, root: str, name: str) -> _View:
-        """Prepare an image of the map, once until its file changes."""
+        """Prepare an image of the map; the result is cached until its file changes."""
         folders = [*([self.verify.map_images] if self.verify.map_images else ()), root]
         files = [pathlib.Path(folder, name) for folder in folders]
         file = next((each for each in files if file_of(each).is_file()), files[0])
@@ -265,11 +263,11 @@ class Verifier:
         return camera.directions(points, view.size, view.name)
 
     def _distance(self, view: _View) -> float:
-        """Return the largest distance of an inlier in directions of the map's camera."""
+        """Return the maximum distance of an inlier in directions of the map's camera."""
         return _POSE_DISTANCE / (self._map_camera.focal(view.size[1]) * view.factor)
 
     def _depths(self, view: _View, name: str, points: _Points) -> Float64[np.ndarray, " n"]:
-        """Return the depth in metres at some pixels of an answer, 0 where it is unknown."""
+        """Return the depth in metres at pixels of an answer, 0 where it is unknown."""
         folder = self.verify.map_depth
         file = pathlib.Path(folder or "", name).with_suffix(".png")
         if folder is None or not file.is_file():
@@ -289,7 +287,7 @@ class Verifier:
 
 
 def _by_depth(first: Verification, second: Verification) -> tuple[Pose, np.ndarray] | None:
-    """Return the query's pose in the first answer's axes, and the way to the second answer."""
+    """Return the query's pose in the first answer's axes, and the vector to the second answer."""
     if first.translation is None or second.translation is None:
         return None
     assert first.rotation is not None
@@ -303,8 +301,8 @@ def order_by_inliers(
 ) -> Int64[np.ndarray, " n"]:
     """Return the order of verified answers, best first.
 
-    An inlier counts as 0.002 of similarity, and the first 50 count: 0.1 at most. Inliers without
-    similarity rank worse than similarity without inliers where local features find few, as between
+    An inlier counts as a similarity of 0.002, and at most 50 count: up to 0.1. Ranking only by
+    inliers is worse than ranking only by similarity where local features find few, as between
     seasons (docs/verification.md has the numbers).
     """
     scores = similarities + _INLIER * np.minimum(inliers, _MOST_INLIERS)

@@ -1,6 +1,6 @@
 """Losses on the descriptors of a batch, and the miner that chooses which pairs enter them.
 
-Each is equal to pytorch-metric-learning's of the same name on unit descriptors.
+Each equals the pytorch-metric-learning loss of the same name on unit descriptors.
 """
 
 import importlib

@@ -42,7 +42,7 @@ class LossBatch:
     pairs: Pairs
     """Pairs that the miner chose."""
     classes: Int[Array, ""] | int | None = None
-    """Number of classes, where the loss has a vector for each."""
+    """Number of classes, if the loss has a vector for each."""
     tokens: Float[Array, "image token dim"] | None = None
     """The field of `Tokens` that the loss's `reads_tokens` names."""
     targets: Float[Array, "image target"] | None = None
@@ -50,12 +50,12 @@ class LossBatch:
 
     @functools.cached_property
     def similarities(self) -> Similarities:
-        """Inner products of all descriptors."""
+        """Inner products of all pairs of descriptors."""
         return inner_products(self.descriptors)
 
     @functools.cached_property
     def distances(self) -> Similarities:
-        """Euclidean distances of all descriptors, with gradient 0 where two are the same."""
+        """Euclidean distances of all pairs of descriptors, with gradient 0 where two are equal."""
         squared = 2 - 2 * self.similarities
         apart = squared > 0
         return jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1)), 0)
@@ -72,7 +72,7 @@ class LossValue(NamedTuple):
 
     loss: Float[Array, ""]
     accuracy: Float[Array, ""] | None = None
-    """Of a classification."""
+    """For classification."""
     numbers: Mapping[str, Any] | None = None
     """Other scalars by name, such as a learnt temperature; each step logs them as `loss.NAME`."""
 
@@ -80,7 +80,7 @@ class LossValue(NamedTuple):
 class Loss(Part, abc.ABC):
     """A loss of a batch: a frozen dataclass whose fields are its constants.
 
-    `apply` alone is required. A plain function of a `LossBatch` that returns a number is a loss
+    Only `apply` is required. A plain function of a `LossBatch` that returns a number is a loss
     without constants.
 
     Example:
@@ -97,15 +97,15 @@ class Loss(Part, abc.ABC):
     """Whether the loss ranks all images, so that no miner may choose pairs."""
 
     of_tuples: ClassVar[bool] = False
-    """Whether the loss takes mined tuples alone, where an image is in a single pair."""
-    learning_rate = 1e-2  # without a type, so that a class may make it a field
-    """Learning rate of the loss's own parameters, which have their own Adam optimizer."""
+    """Whether the loss takes only mined tuples, where an image is in a single pair."""
+    learning_rate = 1e-2  # without a type, so that a subclass can make it a field
+    """Learning rate of the loss's own parameters, which have their own Adam optimiser."""
 
     grouping: ClassVar[ClassesConfig | None] = None
-    """Grouping of images into classes; None where the loss is of pairs of places."""
+    """Grouping of images into classes; None for a loss of pairs of places."""
     reads_tokens: ClassVar[Literal["local", "dense"] | None] = None
-    """Field of `Tokens` that the loss compares, besides descriptors: the aggregator's local tokens,
-    or local features, which few aggregators have in training."""
+    """Field of `Tokens` that the loss also compares: the aggregator's local tokens, or local
+    features, which few aggregators provide in training."""
 
     reads_targets: ClassVar[bool] = False
     """Whether the loss compares descriptors with a teacher's; then images need no places."""
@@ -114,32 +114,32 @@ class Loss(Part, abc.ABC):
         """Return the loss's own trainable parameters, a pytree of arrays; by default None.
 
         Args:
-            key: draws it.
-            classes: number of classes, 0 where the loss is of pairs.
+            key: draws the parameters.
+            classes: number of classes, 0 for a loss of pairs.
             dim: width of a descriptor.
         """
         return None
 
     def from_scratch(self) -> "Loss":
-        """Return the loss with constants that learn from random weights; by default as it is."""
+        """Return the loss with constants for training from random weights; unchanged by default."""
         return self
 
     def with_grouping(self, grouping: ClassesConfig) -> "Loss":
-        """Return the loss with other classes of images; by default as it is."""
+        """Return the loss with other classes of images; unchanged by default."""
         return self
 
     @abc.abstractmethod
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Return the loss of a batch; `params` are of `init`."""
+        """Return the loss of a batch; `params` come from `init`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GivenLoss(Loss):
-    """A plain function that a caller gives in the place of a registered loss."""
+    """A plain function that a caller passes instead of a registered loss."""
 
     part_name: ClassVar[str] = "given"
     function: Callable[..., Any]
-    """Takes a batch; or descriptors and labels, and if it likes which images are valid."""
+    """Takes a batch; or descriptors, labels and, optionally, which images are valid."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Return the function's loss."""
@@ -178,7 +178,7 @@ def inner_products(descriptors: Float[Array, "image descriptor"]) -> Similaritie
 
 
 def mean_of_positive(losses: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Return the mean over the losses above 0; 0 where there is none."""
+    """Return the mean over the losses above 0; 0 if there are none."""
     counted = losses > 0
     return jnp.where(counted, losses, 0).sum() / jnp.maximum(counted.sum(), 1)
 
@@ -192,7 +192,7 @@ def log_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Ar
 
 
 def log1p_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Array, " anchor"]:
-    """Compute log(1 + sum of exp(x) over the chosen entries), stable with its gradient."""
+    """Compute log(1 + sum of exp(x) over the chosen entries), with a stable gradient."""
     chosen = jnp.where(where, x, -jnp.inf)
     # A column of zeros adds the 1 inside the logarithm, and keeps an empty row finite.
     return jax.nn.logsumexp(jnp.pad(chosen, ((0, 0), (0, 1))), axis=1)

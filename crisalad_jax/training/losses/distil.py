@@ -21,7 +21,7 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 
 @LOSSES.register("distil")
 class DistilConfig(Loss):
-    """Distillation from a teacher's descriptors of the same images, which may be longer.
+    """Distillation from a teacher's descriptors of the same images, which can be longer.
 
     The loss is a weighted sum of four terms; a term of weight 0 is not computed. Only `labels`
     uses the images' places.
@@ -39,15 +39,15 @@ class DistilConfig(Loss):
     """Weight of relational distillation (Park et al., CVPR 2019, distance-wise): the Huber loss
     between pairwise distances, each divided by its model's mean distance in the batch."""
     neighbours: NonNegativeFloat = 1.0
-    """Weight of the KL divergence between the softmax of an image's similarities to the rest of the
-    batch, the teacher's and the student's (as in Passalis and Tefas, ECCV 2018)."""
+    """Weight of the KL divergence between the teacher's and the student's softmax of an image's
+    similarities to the rest of the batch (as in Passalis and Tefas, ECCV 2018)."""
     temperature: PositiveFloat = 0.05
     """Temperature of both softmaxes."""
     labels: NonNegativeFloat = 0.0
     """Weight of the multi-similarity loss of the images' places."""
 
     def __post_init__(self) -> None:
-        """Check that some term counts."""
+        """Check that at least one weight is above 0."""
         weights = self.cosine + self.relations + self.neighbours + self.labels
         require_field(self, "cosine", weights > 0, "above 0, or another term's weight")
 
@@ -56,7 +56,7 @@ class DistilConfig(Loss):
         return init_linear(key, dim, self.teacher_dim) if self.cosine else None
 
     def apply(self, params: Linear | None, batch: LossBatch) -> LossValue:
-        """Compute the weighted sum; each term is logged before its weight."""
+        """Compute the weighted sum; each term is logged unweighted."""
         shape = len(batch.labels), self.teacher_dim
         assert batch.targets is not None  # `metric_loss` checks it
         found = batch.targets.shape

@@ -17,29 +17,29 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 class SinkhornDivergenceLoss(MultiSimilarityConfig):
     """Multi-similarity loss of the descriptors, and a triplet loss of the images' local tokens.
 
-    The distance of a triplet is the Sinkhorn divergence (Feydy et al., AISTATS 2019) between the
-    unit local tokens of two images, each of the same mass, by squared Euclidean costs. An anchor's
-    triplet has its least similar positive and its most similar negative, by the descriptors, of the
-    pairs that the miner chose (Hermans et al. 2017). Both mean divergences are logged.
+    Distances in a triplet are Sinkhorn divergences (Feydy et al., AISTATS 2019) between the unit
+    local tokens of two images, all of the same mass, with squared Euclidean costs. From the pairs
+    that the miner chose, an anchor's triplet takes its least similar positive and its most similar
+    negative, by the descriptors (Hermans et al. 2017). Both mean divergences are logged.
     """
 
     reads_tokens: ClassVar[Literal["local", "dense"]] = "local"
 
     weight: PositiveFloat = 1.0
-    """Factor of the triplet loss."""
+    """Weight of the triplet loss."""
     margin: PositiveFloat = 0.1
     """Divergence by which a positive must be nearer than a negative."""
     epsilon: PositiveFloat = 0.1
     """Entropic regularisation, in units of the costs, which are 0 to 4."""
 
     def from_scratch(self) -> Loss:
-        """Return base 0.5, as of the multi-similarity loss."""
+        """Return the loss with base 0.5, as for the multi-similarity loss."""
         return dataclasses.replace(self, base=0.5)
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Add the mean violation of the margin over the anchors that have both pairs."""
+        """Add the mean violation of the margin over the anchors that have both kinds of pairs."""
         assert batch.tokens is not None
-        # What takes no part may be NaN.
+        # Images that take no part may be NaN.
         tokens = l2_normalise(jnp.where(batch.valid[:, None, None], batch.tokens, 0))
         sets = tokens, log_masses(tokens).astype(tokens.dtype)
 

@@ -1,4 +1,4 @@
-"""Large-margin cosine loss over classes (CosFace, Wang et al., CVPR 2018), as CosPlace trains."""
+"""Large-margin cosine loss over classes (CosFace, Wang et al., CVPR 2018), as in CosPlace."""
 
 import dataclasses
 from typing import Any
@@ -24,7 +24,7 @@ class LargeMarginCosineConfig(Loss):
     margin: Fraction = 0.4
     """Margin subtracted from the cosine of an image's own class."""
     learning_rate: PositiveFloat = 0.01
-    """Learning rate of the classifiers, which train by an Adam of their own, without decay."""
+    """Learning rate of the classifiers, which have their own Adam, without decay."""
     classes: ClassesConfig = ClassesConfig()
     """Grouping of images into classes."""
 
@@ -38,16 +38,16 @@ class LargeMarginCosineConfig(Loss):
         return dataclasses.replace(self, classes=grouping)
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Float[Array, "class dim"]:
-        """Draw vectors for the classes (Glorot and Bengio 2010, uniform, as CosPlace's)."""
+        """Draw vectors for the classes (Glorot and Bengio 2010, uniform, as in CosPlace)."""
         bound = jnp.sqrt(6 / (jnp.asarray(classes, jnp.float32) + dim))
         return bound * jax.random.uniform(key, (classes, dim), jnp.float32, -1, 1)
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Compute the cross entropy of cosines to classes' vectors (CosFace, equation 4).
+        """Compute the cross entropy of cosines to class vectors (CosFace, equation 4).
 
         The margin is subtracted from the cosine of an image and its own class, then all cosines are
         multiplied by the scale. The means are over the valid images; the accuracy is the share
-        whose nearest class is their own. Only directions count.
+        whose nearest class is their own. Only directions matter.
 
         Args:
             params: a vector for each class; those beyond `batch.classes` are padding.

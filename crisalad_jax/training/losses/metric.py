@@ -47,7 +47,7 @@ class LossConfig:
 
 
 class LossResult(NamedTuple):
-    """The loss and what is logged beside it."""
+    """The loss and what is logged with it."""
 
     loss: Float[Array, ""]
     easy_anchor_fraction: Float[Array, ""]
@@ -80,18 +80,18 @@ def metric_loss(
         labels: the place, or class, of each image.
         config: which loss and miner, and their constants.
         valid: images that take part; None means all. The others are neither anchors nor pairs.
-        params: what trains beside the model (`Loss.init`).
-        classes: number of classes, where `params` have a vector for each and more.
+        params: the loss's own trainable parameters (`Loss.init`).
+        classes: number of classes, if `params` have a vector for each, and padding.
         pairs: the pairs to choose from, such as `tuple_pairs`; None means `all_pairs`.
         tokens: local tokens or features of each image, for a loss that compares them.
         targets: a teacher's unit descriptors of the images, for a loss that compares them.
 
     Returns:
-        The loss and what is logged beside it.
+        The loss and what is logged with it.
 
     Raises:
-        InputError: a loss returns something else than a number, or lacks its parameters, local
-            features, tuples or targets.
+        InputError: a loss returns something other than a number, or its parameters, local features,
+            tuples or targets are missing.
 
     Example:
         >>> import jax.numpy as jnp
@@ -121,7 +121,7 @@ def metric_loss(
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
     if valid is None:
         valid = jnp.ones(len(labels), bool)
-    else:  # what takes no part may be NaN
+    else:  # images that take no part may be NaN
         wide = jnp.where(valid[:, None], wide, 0)
     every = all_pairs(labels, valid=valid) if pairs is None else pairs
     batch = LossBatch(wide, labels, valid, every, classes, tokens, targets)
@@ -138,6 +138,6 @@ def metric_loss(
     loss = jnp.where(jnp.isfinite(similarities).all(), loss, jnp.nan)
     # In tuples only queries are anchors.
     anchors = batch.anchors if pairs is None else jnp.maximum(pairs.positives.any(axis=1).sum(), 1)
-    # Of two whole numbers JAX's 64-bit mode makes a float64.
+    # In 64-bit mode JAX divides two integers to a float64.
     easy = 1 - mined.positives.any(axis=1).sum(dtype=wide.dtype) / anchors
     return LossResult(loss, easy, value.accuracy, jax.tree.map(jnp.asarray, value.numbers))

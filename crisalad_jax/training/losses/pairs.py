@@ -10,7 +10,7 @@ from crisalad_jax.training.losses.base import Pairs, Similarities
 
 
 def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None) -> Pairs:
-    """Find all pairs of two images of one place, and of two places; none of images not `valid`.
+    """Find all pairs of `valid` images, of the same place and of two places.
 
     Args:
         labels: the place of each image.
@@ -30,16 +30,16 @@ def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | No
 
 
 def mine(similarities: Similarities, pairs: Pairs, *, margin: float) -> Pairs:
-    """Choose the pairs that violate the order within their row, or keep it by less than `margin`.
+    """Choose the pairs that violate the order within their row, or meet it by less than `margin`.
 
-    The miner of the multi-similarity loss (Wang et al., CVPR 2019). A positive is kept if it is
-    less similar than the hardest negative plus the margin, a negative if it is more similar than
-    the hardest positive minus the margin, strictly. An anchor without positives or without
-    negatives mines nothing.
+    The miner of the multi-similarity loss (Wang et al., CVPR 2019). A positive is chosen if it is
+    strictly less similar than the hardest negative plus the margin, a negative if it is strictly
+    more similar than the hardest positive minus the margin. An anchor without positives or without
+    negatives gets no pairs.
 
     Args:
-        similarities: of all images.
-        pairs: to choose from.
+        similarities: similarities of all images.
+        pairs: the pairs to choose from.
         margin: epsilon of the paper.
 
     Returns:
@@ -68,11 +68,11 @@ class Role(enum.IntEnum):
     POSITIVE = 1
     NEGATIVE = 2
     SPARE = 3
-    """Of no pair: it fills a tuple whose query has too few hard negatives."""
+    """In no pair: fills a tuple whose query has too few hard negatives."""
 
 
 def tuple_labels(roles: Int[np.ndarray, "tuple image"]) -> Int[np.ndarray, "tuple image"]:
-    """Make the labels that `tuple_pairs` reads: the tuple's number and the image's role in one.
+    """Make the labels that `tuple_pairs` reads: each encodes a tuple's number and an image's role.
 
     Args:
         roles: a `Role` for each image of each tuple.
@@ -94,11 +94,11 @@ def tuple_pairs(
     """Find the pairs of each tuple, whose anchor is its query.
 
     Args:
-        labels: those of `tuple_labels`.
+        labels: the labels from `tuple_labels`.
         valid: images that take part; None means all.
 
     Returns:
-        The positive and the negative pairs; their rows are those of queries alone.
+        The positive and the negative pairs; only queries' rows have any.
 
     Example:
         >>> import jax.numpy as jnp

@@ -20,7 +20,7 @@ from crisalad_jax.training.losses.base import (
 
 @LOSSES.register("multi-similarity")
 class MultiSimilarityConfig(Loss):
-    """Multi-similarity loss (Wang et al., CVPR 2019), the constants of GSV-Cities."""
+    """Multi-similarity loss (Wang et al., CVPR 2019) with the constants of GSV-Cities."""
 
     alpha: PositiveFloat = 1.0
     beta: PositiveFloat = 50.0
@@ -28,7 +28,7 @@ class MultiSimilarityConfig(Loss):
     """Similarity around which pairs are weighted. From random weights 0.5 learns where 0 fails."""
 
     def from_scratch(self) -> Loss:
-        """Return base 0.5: from random weights base 0 drives all similarities to 0 together."""
+        """Use base 0.5: from random weights, base 0 drives all similarities to 0 together."""
         return MultiSimilarityConfig(base=0.5)
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
@@ -44,7 +44,7 @@ class MultiSimilarityConfig(Loss):
 
 @LOSSES.register("contrastive")
 class ContrastiveConfig(Loss):
-    """Contrastive loss (Hadsell et al., CVPR 2006), the margins of GSV-Cities."""
+    """Contrastive loss (Hadsell et al., CVPR 2006) with the margins of GSV-Cities."""
 
     positive_margin: Annotated[float, limited(0, 2)] = 0.0
     """Distance up to which a pair of one place costs nothing; unit vectors are at most 2 apart."""
@@ -61,12 +61,12 @@ class ContrastiveConfig(Loss):
 
 @LOSSES.register("triplet")
 class TripletConfig(Loss):
-    """Triplet margin loss (Schroff et al., CVPR 2015), the margin of GSV-Cities."""
+    """Triplet margin loss (Schroff et al., CVPR 2015) with the margin of GSV-Cities."""
 
     margin: PositiveFloat = 0.1
     """Distance by which a positive must be nearer than a negative."""
     average: Literal["violating", "all"] = "violating"
-    """Triplets that the mean is over: those that violate the margin, or all (NetVLAD's code)."""
+    """Triplets to average over: those that violate the margin, or all (NetVLAD's code)."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Average the violations of the margin over triplets of distances.
@@ -92,7 +92,7 @@ class TripletConfig(Loss):
 
 @LOSSES.register("supcon")
 class SupConConfig(Loss):
-    """Supervised contrastive loss (Khosla et al., NeurIPS 2020), GSV-Cities' temperature."""
+    """Supervised contrastive loss (Khosla et al., NeurIPS 2020) with GSV-Cities' temperature."""
 
     temperature: PositiveFloat = 0.07
 
@@ -110,7 +110,7 @@ class SupConConfig(Loss):
 
 @LOSSES.register("circle")
 class CircleConfig(Loss):
-    """Circle loss (Sun et al., CVPR 2020), the constants of GSV-Cities."""
+    """Circle loss (Sun et al., CVPR 2020) with the constants of GSV-Cities."""
 
     margin: Fraction = 0.4
     """Relaxation margin, the paper's m."""
@@ -118,7 +118,7 @@ class CircleConfig(Loss):
     """Scale of the similarities, the paper's gamma."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Weigh each similarity by how far it is from its optimum."""
+        """Weight each similarity by its distance from its optimum."""
         margin, scale = self.margin, self.scale
         fixed = jax.lax.stop_gradient(batch.similarities)
         pull = -scale * jax.nn.relu(1 + margin - fixed) * (batch.similarities - (1 - margin))
@@ -132,7 +132,7 @@ class CircleConfig(Loss):
 
 @LOSSES.register("fast-ap")
 class FastAPConfig(Loss):
-    """FastAP (Cakir et al., CVPR 2019), GSV-Cities' number of bins."""
+    """FastAP (Cakir et al., CVPR 2019) with GSV-Cities' number of bins."""
 
     ranks_all: ClassVar[bool] = True
     bins: PositiveInt = 30
@@ -170,11 +170,11 @@ class SelaVprLoss(Loss):
     """Distance by which a positive's descriptor must be nearer than a negative's."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Add the mean of the triplets of descriptors and that of local similarities."""
+        """Add the mean triplet losses of descriptors and of local similarities."""
         assert batch.tokens is not None
         dense = batch.tokens
         positives, negatives = batch.pairs
-        # Each image but a query is in a single pair.
+        # Each image except a query is in a single pair.
         anchor = (positives | negatives).argmax(axis=0)
         similarities = jax.lax.map(
             lambda pair: mutual_similarity(dense[pair[0]], dense[pair[1]]),
@@ -191,7 +191,7 @@ class SelaVprLoss(Loss):
 def mutual_similarity(
     first: Float[Array, "first dim"], second: Float[Array, "second dim"]
 ) -> Float[Array, ""]:
-    """Average the inner products of the features that are each other's nearest.
+    """Average the inner products of features that are mutual nearest neighbours.
 
     Args:
         first: unit features of an image.

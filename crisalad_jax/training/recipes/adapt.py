@@ -1,4 +1,4 @@
-"""The recipe of adaptation: few small steps on the images of one map."""
+"""The recipe for adaptation: a few small steps on the images of one map."""
 
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -9,14 +9,14 @@ from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD
 CHANGES = LightAugmentConfig(
     crop=0.3, shift=0.1, rotation=5, blur=1.5, colour=0.4, gamma=0.4, illumination=0.6
 )
-"""Stand for another day: a map's images alone show each place in one light."""
+"""Simulates another day: a map's own images show each place in one light only."""
 
 
 @register_recipe("adapt")
 def adapt(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of `crisalad adapt`: two views of each of 32 places.
 
-    The adapters and the head train, of a model without adapters the head alone.
+    The adapters and the head train, or only the head if the model has no adapters.
     """
     return TrainConfig(
         model=model,

@@ -1,4 +1,4 @@
-"""Recipes: how a published method is trained, by its name; or a recipe with one part swapped."""
+"""Recipes: training configurations of published methods by name, or with one part swapped."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
@@ -22,22 +22,22 @@ from crisalad_jax.utils.output import warn
 Make = Callable[[ModelConfig, str], TrainConfig]
 """Takes the model of a preset and the preset's name; returns the configuration."""
 RECIPES: dict[str, Make] = {}
-"""Recipes by name. A published method's name is that of its own training. Rows of Table 2 that are
-missing here differ from `crisalad` by one flag."""
+"""Recipes by name. A published method's name stands for its original training. Rows of Table 2 that
+are missing here differ from `crisalad` by one flag."""
 
 
 def register_recipe(name: str) -> Callable[[Make], Make]:
     """Make a decorator that registers a function as the recipe `name`.
 
     Args:
-        name: what flags call the recipe.
+        name: the recipe's name in flags.
 
     Returns:
         The decorator; the function takes the model of a preset and the preset's name, and returns
-        how to train.
+        the training configuration.
 
     Raises:
-        InputError: when it decorates: the name is taken by another function.
+        InputError: on decoration, if the name is taken by another function.
 
     Example:
         >>> @register_recipe("crisalad-two-epochs")
@@ -58,16 +58,16 @@ def register_recipe(name: str) -> Callable[[Make], Make]:
 def recipe(
     preset: str = "b14", name: str | None = None, *, model: ModelConfig | None = None
 ) -> TrainConfig:
-    """Look up how a model is trained, and which parts it has for that.
+    """Look up a training configuration, which includes the parts of the model.
 
     Args:
         preset: the size of the model (`PRESETS`).
         name: what to reproduce (`RECIPES`), or RECIPE+PART: a recipe with a registered part, as
-            NAME or KIND:NAME, in the place of its own. A part alone stands for crisalad+PART. None
-            is the paper's way, except for `tiny`, which starts from nothing.
-        model: that of weights to start from, in place of the preset's and the recipe's. It is
-            trained and validated at its own image size. Where the recipe trains adapters too and it
-            has none, its head alone trains.
+            NAME or KIND:NAME, in place of its own. PART by itself means crisalad+PART. None is the
+            paper's recipe, except for `tiny`, which trains from scratch.
+        model: the model of the weights to start from, in place of the preset's and the recipe's. It
+            is trained and validated at its own image size. If the recipe trains adapters and the
+            model has none, only its head trains.
 
     Returns:
         The configuration of a training run.
@@ -96,7 +96,7 @@ def recipe(
 
 
 def _of_model(config: TrainConfig, model: ModelConfig | None) -> TrainConfig:
-    """Return a recipe for another model than its own, if there is one."""
+    """Apply a recipe to another model than its own, if one is given."""
     if model is None:
         return config
     fits = ADAPTERS not in terms_of(config.trainable) or has_adapters(model)
@@ -118,17 +118,17 @@ def model_of(
     """Make the model of a published method, without a cross-image encoder.
 
     Training images are resized as `PreprocessingConfig.for_training` says, whatever is set here. A
-    model that normalises by local contrast, as `tiny`, takes the filter alone: it is no published
-    one.
+    model that normalises by local contrast, such as `tiny`, takes only the filter: it is not a
+    published one.
 
     Args:
-        model: the preset's.
-        preset: its name.
-        backbone: the method's.
-        aggregator: name of the head, which comes in the preset's size; None keeps the model's.
-        head: settings of the head that are other than the preset's.
-        image_size: height and width over a convolutional backbone, which for `tiny` is a small
-            ResNet with its images; None is the preset's.
+        model: the preset's model.
+        preset: the preset's name.
+        backbone: the method's backbone.
+        aggregator: name of the head, made in the preset's size; None keeps the model's.
+        head: settings of the head that differ from the preset's.
+        image_size: height and width for a convolutional backbone, which for `tiny` is a small
+            ResNet at its own image size; None is the preset's.
         compute_dtype: see `ModelConfig`.
         **preprocessing: how photographs are resized, as fields of `PreprocessingConfig`.
 
@@ -157,12 +157,12 @@ def model_of(
 
 
 def validation_size(preset: str, side: int) -> tuple[int, int] | None:
-    """Return the size that a recipe's code validates at; None for preset tiny."""
+    """Return the image size at which a method's code validates; None for preset tiny."""
     return None if preset == "tiny" else (side, side)
 
 
 def split_name(name: str) -> tuple[str | None, str]:
-    """Split RECIPE+PART into the two; of a part alone the recipe is None.
+    """Split RECIPE+PART into the two names; the recipe is None if there is only a part.
 
     Example:
         >>> split_name("crisalad+step:newton"), split_name("gem")
@@ -173,7 +173,7 @@ def split_name(name: str) -> tuple[str | None, str]:
 
 
 def mines_tuples(name: str) -> bool:
-    """Return whether a name is that of a recipe that mines tuples.
+    """Return whether a name belongs to a recipe that mines tuples.
 
     Example:
         >>> mines_tuples("netvlad"), mines_tuples("salad"), mines_tuples("crisalad+netvlad")
@@ -183,20 +183,20 @@ def mines_tuples(name: str) -> bool:
 
 
 def mixes_sets(name: str) -> bool:
-    """Return whether a name is that of a recipe that trains on a mixture of sets."""
+    """Return whether a name belongs to a recipe that trains on a mixture of sets."""
     return name in RECIPES and bool(recipe("b14", name).mixture)
 
 
 def find_part(
     name: str, preset: str, *, what: str = "recipe", others: Iterable[str] = RECIPES
 ) -> Part:
-    """Look up a part that `with_part` can put in place.
+    """Look up a part that `with_part` can swap in.
 
     Args:
-        name: the part's name, or KIND:NAME where several kinds have one of it.
-        preset: the size of the model, which the part comes in.
+        name: the part's name, or KIND:NAME if several kinds have a part of that name.
+        preset: the size of the model, which is also that of the part.
         what: what messages call the name.
-        others: names that could have been given in the place of a part's, for messages.
+        others: names that are accepted instead of a part's, for messages.
 
     Returns:
         The part.
@@ -234,11 +234,11 @@ _KINDS = (
 
 
 def with_part(config: TrainConfig, part: Any) -> TrainConfig:
-    """Replace a recipe's part by another of the same kind, and train all else as it does.
+    """Replace a recipe's part with another of the same kind, and leave the rest as it is.
 
-    Another aggregator has no cross-image encoder: its descriptor depends on its own image alone. Of
-    CriSALAD the backbone stays frozen, with the same adapters, so that methods differ only in what
-    they make of its features. An adapter trains with the head, unless all trains.
+    A model with another aggregator has no cross-image encoder: its descriptors are single-image.
+    CriSALAD's backbone stays frozen, with the same adapters, so that methods differ only in how
+    they use its features. A new adapter trains together with the head, unless everything trains.
 
     Raises:
         InputError: the part does not fit, or the recipe has no place for it.
@@ -278,7 +278,7 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
         return dataclasses.replace(config, model=dataclasses.replace(model, cross_image=part))
     if kind == "aggregator":
         return dataclasses.replace(config, model=with_head(model, part), validation_size=None)
-    # A dustbin is a setting of the aggregator, and the transport's other parts of the solver.
+    # The dustbin is a setting of the aggregator; the transport's other parts belong to the solver.
     field = "dustbin" if kind == "dustbin" else "sinkhorn"
     require(
         hasattr(model.aggregator, field),
@@ -298,12 +298,12 @@ def with_head(model: ModelConfig, aggregator: Any) -> ModelConfig:
 
 @takes(config=TrainConfig)
 def from_scratch(config: TrainConfig) -> TrainConfig:
-    """Make another recipe's model and loss train from random weights, as `scratch` does.
+    """Change a recipe so that its model trains from random weights, as in `scratch`.
 
-    The recipe's model and kind of loss are kept, for they make its method. The optimiser, the
-    loss's constants, the augmentation and the batches are those of `scratch`, in float32. All of
-    the model trains. A plug-in's augmentation is kept, and so are batches of mined tuples, and of a
-    mixture of sets.
+    The recipe's model and kind of loss stay, because they define its method. The optimiser, the
+    loss's constants, the augmentation and the batches are those of `scratch`, in float32. The whole
+    model trains. A plug-in's augmentation stays, and so do batches of mined tuples and of a mixture
+    of sets.
 
     Args:
         config: the recipe.

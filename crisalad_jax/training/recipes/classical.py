@@ -1,4 +1,4 @@
-"""Visual words of hand-made features, of which nothing trains: `with_vocabulary` is all."""
+"""Visual words of hand-crafted features: the only training is `with_vocabulary`."""
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
@@ -10,7 +10,7 @@ from crisalad_jax.training.recipes.base import register_recipe
 
 @register_recipe("sift-vlad")
 def sift_vlad(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SIFT with VLAD (Jegou et al., CVPR 2010): 64 words, 8,192 numbers."""
+    """Make SIFT with VLAD (Jegou et al., CVPR 2010): 64 words, 8,192 dimensions."""
     return _words("sift", "vlad", preset)
 
 
@@ -27,7 +27,7 @@ def orb_bow(model: ModelConfig, preset: str) -> TrainConfig:
 
 
 def _words(backbone: str, aggregator: str, preset: str) -> TrainConfig:
-    """Photographs keep their sizes up to a longer side of 640, whatever the preset's images."""
+    """Make a recipe that keeps photographs' sizes up to a longer side of 640, for any preset."""
     unit = 1 / 255
     model = ModelConfig(
         image_size=(480, 640),

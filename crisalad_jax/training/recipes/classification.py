@@ -1,6 +1,6 @@
 """CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023): classification of places.
 
-Over ResNet they are the codes' own, over our ViT what the paper compares.
+Over ResNet they follow the published code; over our ViT, the paper's comparison.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ _VIEWPOINTS = LargeMarginCosineConfig(
 
 
 def _classified(model: ModelConfig, loss: LargeMarginCosineConfig, **fields: Any) -> TrainConfig:
-    """Make what both codes share: Adam at 1e-5, and 32 classes, an image of each."""
+    """Make what both methods share: Adam at 1e-5, and 32 classes with one image of each."""
     return TrainConfig(
         model=model,
         loss=LossConfig(kind=loss),
@@ -41,7 +41,7 @@ def _classified(model: ModelConfig, loss: LargeMarginCosineConfig, **fields: Any
 def _over_resnet(
     model: ModelConfig, preset: str, loss: LargeMarginCosineConfig, dtype: str, **fields: Any
 ) -> TrainConfig:
-    """Make a recipe over ResNet-18, whose last two stages train, for images at their own sizes."""
+    """Make a recipe over ResNet-18, whose last two stages train, for images at native sizes."""
     return _classified(
         model_of(
             *(model, preset, ResNetConfig(layers=18), "cosplace"),
@@ -59,10 +59,10 @@ def _over_resnet(
 
 @register_recipe("cosplace")
 def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make CosPlace's recipe, of gmberton/CosPlace: ResNet-18 and 512 numbers, its code's defaults.
+    """Make CosPlace's recipe, from gmberton/CosPlace: its defaults, ResNet-18 and 512 dimensions.
 
-    Classes are cells of position and heading, which ask for the headings of `northdeg`, and for
-    many images of a spot, as in San Francisco XL. Images are described at their own sizes.
+    Classes are cells of position and heading: they need the headings of `northdeg`, and many images
+    of a spot, as in San Francisco XL. Images are described at their native sizes.
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(kind="cells", steps=10_000))
     return _over_resnet(model, preset, loss, "float32", min_images=10, epochs=50)
@@ -70,11 +70,11 @@ def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("eigenplaces-turns")
 def eigenplaces_turns(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make EigenPlaces' recipe, of gmberton/EigenPlaces, with two differences.
+    """Make EigenPlaces' recipe, from gmberton/EigenPlaces, with two differences.
 
-    A step of its code takes a batch of lateral and one of frontal classes, here they take turns by
-    epochs, of which there are twice as many. It cuts images out of panoramas, towards the focal
-    point; here photographs have the headings that they have.
+    A step of its code takes one batch of lateral and one of frontal classes; here they alternate by
+    epoch, over twice as many epochs. Its code crops images from panoramas, towards the focal point;
+    here photographs keep their own headings.
     """
     return _over_resnet(model, preset, _VIEWPOINTS, "bfloat16", min_images=5, epochs=80)
 
@@ -83,7 +83,7 @@ def eigenplaces_turns(model: ModelConfig, preset: str) -> TrainConfig:
 def cosplace_vit(model: ModelConfig, preset: str) -> TrainConfig:
     """Make CosPlace's recipe for our ViT, whose adapters and head train.
 
-    Images have the ViT's size, and RandAugment. The classes are GSV-Cities' places, for each of
+    Images have the ViT's size, and RandAugment. The classes are GSV-Cities' places, because each of
     them is one spot in one direction.
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(steps=10_000))
@@ -95,7 +95,7 @@ def cosplace_vit(model: ModelConfig, preset: str) -> TrainConfig:
 def eigenplaces_vit(model: ModelConfig, preset: str) -> TrainConfig:
     """Make EigenPlaces' recipe for our ViT: viewpoint classes, longer descriptors.
 
-    As in `eigenplaces_turns`, lateral and frontal classes take turns by epochs.
+    As in `eigenplaces_turns`, lateral and frontal classes alternate by epoch.
     """
     head: Any = AGGREGATORS.make("cosplace", preset)
     head = dataclasses.replace(head, dim=4 * head.dim)

@@ -1,6 +1,6 @@
 """Recipes over ResNet: MixVPR, Conv-AP, BoQ, and the `starter` of this package.
 
-Their sizes are the published ones for every preset but `tiny`, whose backbone is smaller.
+Their sizes are the published ones for every preset except `tiny`, whose backbone is smaller.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from crisalad_jax.training.schedules import MilestonesSchedule
 
 @register_recipe("mixvpr")
 def mixvpr(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make MixVPR's recipe, of amaralibey/MixVPR: ResNet-50, whose third stage trains, and SGD."""
+    """Make MixVPR's recipe, from amaralibey/MixVPR: SGD and ResNet-50, whose third stage trains."""
     return TrainConfig(
         model=model_of(
             *(model, preset, ResNetConfig(stages=3), "mixvpr"),
@@ -39,10 +39,10 @@ def mixvpr(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("conv-ap")
 def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make Conv-AP's recipe, of amaralibey/gsv-cities: ResNet-50, whose last two stages train.
+    """Make Conv-AP's recipe, from amaralibey/gsv-cities: ResNet-50, whose last two stages train.
 
-    The head and the filter, bicubic, are those of its model of 4,096 numbers. Its optimiser is
-    called Adam there, and is AdamW.
+    The head and the bicubic filter are those of its model with 4,096 dimensions. The optimiser that
+    its code calls Adam is AdamW.
     """
     return TrainConfig(
         model=model_of(
@@ -69,7 +69,7 @@ def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
 def boq_resnet50(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of BoQ over ResNet-50, whose second and third stages train.
 
-    The head is that of the published weights, of 16,384 numbers.
+    The head is that of the published weights, with 16,384 dimensions.
     """
     return TrainConfig(
         model=model_of(
@@ -87,9 +87,9 @@ def boq_resnet50(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("starter")
 def starter(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of `starter`'s last run, of 24,000 places (`render --scenes 6000`).
+    """Make the recipe of `starter`'s last run, on 24,000 places (`render --scenes 6000`).
 
-    Its weights started from a first run of smaller images, which docs/starter.md describes.
+    It started from the weights of an earlier run on smaller images; see docs/starter.md.
     """
     whole = model_of(
         *(model, preset, ResNetConfig(layers=18, stages=3, width=32), "conv-ap"),

@@ -1,7 +1,7 @@
 """Recipes over DINOv2, each as its authors' code trains it.
 
-All but CricaVPR's have no cross-image encoder. Where a code validates at a larger size, so do
-these, but for preset tiny, which validates at the model's.
+Only CricaVPR's has a cross-image encoder. If a method's code validates at a larger size, so does
+its recipe, except for preset tiny, which validates at the model's.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from crisalad_jax.training.schedules import MilestonesSchedule, StepSchedule
 from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD
 
 ADAM_STEP = OptimiserConfig(kind="adam", learning_rate=5e-5, schedule="step", weight_decay=0.0)
-"""Of CricaVPR's code, and of those that grew from it."""
+"""From CricaVPR's code and the code derived from it."""
 BOQ_TRAINING: dict[str, Any] = {
     "optimiser": OptimiserConfig(
         learning_rate=1e-4,
@@ -37,7 +37,7 @@ BOQ_TRAINING: dict[str, Any] = {
     "monitor": "R@1",
     "patience": None,
 }
-"""What BoQ's code has for all its backbones."""
+"""Settings of BoQ's code for all its backbones."""
 MIXVPR_OPTIMISER = OptimiserConfig(
     kind="sgd",
     learning_rate=0.05,
@@ -45,7 +45,7 @@ MIXVPR_OPTIMISER = OptimiserConfig(
     warmup_steps=650,
     weight_decay=1e-3,
 )
-"""That of amaralibey/MixVPR, for 120 places."""
+"""From amaralibey/MixVPR, for 120 places."""
 
 
 _HALF_FLOATS: dict[str, Any] = {
@@ -53,7 +53,7 @@ _HALF_FLOATS: dict[str, Any] = {
     "pixels": "floats",
     "round_to_patch": True,
 }
-"""How several codes compute and prepare images."""
+"""How several methods' code computes and prepares images."""
 
 
 def _vit(model: ModelConfig, *, adapter: Adapter | str = "none", **fields: Any) -> Any:
@@ -63,18 +63,18 @@ def _vit(model: ModelConfig, *, adapter: Adapter | str = "none", **fields: Any) 
 
 @register_recipe("anyloc")
 def anyloc(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make AnyLoc's recipe (Keetha et al., RA-L 2023), of whose model nothing trains."""
+    """Make AnyLoc's recipe (Keetha et al., RA-L 2023), in which nothing trains."""
     return TrainConfig(model=model_of(model, preset, _vit(model), "anyloc"), trainable="head")
 
 
 @register_recipe("salad")
 def salad(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SALAD's recipe, of serizba/salad (Izquierdo and Civera, CVPR 2024).
+    """Make SALAD's recipe, from serizba/salad (Izquierdo and Civera, CVPR 2024).
 
     There is no adapter or encoder; the last four blocks train in mixed precision.
 
-    Its code also moves the schedule on by a step at the end of each epoch, which is left out: a
-    learning rate lower by less than 1 part in 1,000.
+    Its code also advances the schedule by one step at the end of each epoch. This is left out: it
+    lowers the learning rate by less than 1 part in 1,000.
     """
     return TrainConfig(
         model=model_of(model, preset, _vit(model), None, compute_dtype="bfloat16"),
@@ -89,11 +89,11 @@ def salad(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("vlad-buff")
 def vlad_buff(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make VLAD-BuFF's recipe, of Ahmedest61/VLAD-BuFF (Khaliq et al., ECCV 2024).
+    """Make VLAD-BuFF's recipe, from Ahmedest61/VLAD-BuFF (Khaliq et al., ECCV 2024).
 
-    It is SALAD's training of another head, which starts from principal components and centroids of
-    500 training images. The code takes images of London for these; its published weights are those
-    of the last epoch.
+    It is SALAD's training with another head, which starts from principal components and centroids
+    of 500 training images. The code uses images of London for these; its published weights are
+    those of the last epoch.
     """
     whole = model_of(model, preset, _vit(model), "vlad-buff", compute_dtype="bfloat16")
     return dataclasses.replace(salad(model, preset), model=whole)
@@ -101,11 +101,11 @@ def vlad_buff(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("cricavpr")
 def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make CricaVPR's recipe, of Lu-Feng/CricaVPR (Lu et al., CVPR 2024).
+    """Make CricaVPR's recipe, from Lu-Feng/CricaVPR (Lu et al., CVPR 2024).
 
-    It has multi-resolution adapters, a GeM pyramid, and Adam with step decay. Its README trains 10
-    epochs, fewer than its patience of 10 would ever end. The best weights are those of the best
-    R@5, as in its code of today; its first version added R@1.
+    It has multi-resolution adapters, a GeM pyramid, and Adam with step decay. Its README trains for
+    10 epochs, too few for its patience of 10 to take effect. The best weights are those with the
+    best R@5, as in its current code; its first version added R@1.
     """
     backbone = _vit(model, adapter="multi-resolution")
     alone = model_of(model, preset, backbone, "gem-pyramid", antialias=False, pixels="floats")
@@ -120,12 +120,12 @@ def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("selavpr")
 def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SelaVPR's recipe, of Lu-Feng/SelaVPR (ICLR 2024): of preset l14, tuples mined in MSLS.
+    """Make SelaVPR's recipe, from Lu-Feng/SelaVPR (ICLR 2024): preset l14, tuples mined in MSLS.
 
-    4 tuples of a query, a positive and 2 negatives make a batch; the loss compares descriptors and
-    local features. An epoch has 30,000 queries, in rounds of 1,000. For Pitts30k, which follows
-    from the weights of MSLS, it has 5,000: `--mining.queries-per-epoch 5000`. The code validates
-    with re-ranking, here without.
+    A batch is 4 tuples of a query, a positive and 2 negatives; the loss compares descriptors and
+    local features. An epoch has 30,000 queries, in rounds of 1,000. For Pitts30k, which starts from
+    the MSLS weights, it has 5,000: `--mining.queries-per-epoch 5000`. The code validates with
+    re-ranking; this recipe does not.
     """
     backbone = _vit(model, adapter="serial-parallel")
     return TrainConfig(
@@ -145,11 +145,11 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("selavprpp")
 def selavprpp(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SelaVPR++'s recipe, of Lu-Feng/SelaVPRplusplus (Lu et al. 2025): its first stage.
+    """Make SelaVPR++'s recipe, from Lu-Feng/SelaVPRplusplus (Lu et al. 2025): its first stage.
 
-    Adapters on a path beside the frozen blocks, the last 16 of preset l14, and the head train. Its
-    data are GSV-Cities and parts of other sets as places of one layout. The second stage, which
-    trains another path for the signs of its numbers, is not here.
+    What trains is the head, and adapters on a path parallel to the frozen blocks (for preset l14,
+    the last 16). Its data are GSV-Cities and parts of other sets as places in one layout. The
+    second stage, which trains another path for the signs of the descriptor, is not included.
     """
     is_large = preset == "l14"
     adapter = SideMultiResolutionConfig(last=16 if is_large else None)
@@ -170,9 +170,9 @@ def selavprpp(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("edtformer")
 def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make EDTformer's recipe, of Tong-Jin01/EDTformer (Jin et al. 2025).
+    """Make EDTformer's recipe, from Tong-Jin01/EDTformer (Jin et al. 2025).
 
-    It has adapters of width 4 beside the blocks, a decoder, and Adam with step decay.
+    It has adapters of width 4 parallel to the blocks, a decoder, and Adam with step decay.
     """
     adapter = SideConfig(bottleneck=4 / model.backbone.dim, alpha=0.5)
     backbone = _vit(model, adapter=adapter)
@@ -190,11 +190,11 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("supervlad")
 def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SuperVLAD's recipe, of Lu-Feng/SuperVLAD (NeurIPS 2024), without its encoder.
+    """Make SuperVLAD's recipe, from Lu-Feng/SuperVLAD (NeurIPS 2024), without its encoder.
 
     The last four blocks train. Scores start from k-means centroids of 5,000 training images. The
-    code takes images of MSLS for these, at 322 x 322. (Its encoder of the cross-image model has an
-    optimiser of its own, which after the first step finds no gradient.)
+    code uses images of MSLS for these, at 322 x 322. (The encoder of its cross-image model has a
+    separate optimiser, which gets no gradient after the first step.)
     """
     return TrainConfig(
         model=model_of(
@@ -211,11 +211,11 @@ def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("image")
 def image(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make ImAge's recipe, of Lu-Feng/ImAge (NeurIPS 2025): DINOv2 with registers.
+    """Make ImAge's recipe, from Lu-Feng/ImAge (NeurIPS 2025): DINOv2 with registers.
 
-    The blocks train from the one on that the tokens enter at. The tokens start from centroids of
-    the last features of 5,000 training images. The code takes images of MSLS for these, unless
-    asked otherwise, at 322 x 322.
+    The blocks train from the one where the tokens enter. The tokens start from centroids of the
+    last features of 5,000 training images. The code uses images of MSLS for these by default, at
+    322 x 322.
     """
     config = model_of(
         model,
@@ -235,10 +235,10 @@ def image(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("boq")
 def boq(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make BoQ's recipe over DINOv2, of amaralibey/Bag-of-Queries (Ali-bey et al., CVPR 2024).
+    """Make BoQ's recipe over DINOv2, from amaralibey/Bag-of-Queries (Ali-bey et al., CVPR 2024).
 
-    The last two blocks train. The head is that of the published weights, of 12,288 numbers; the
-    code's own default is wider and has 8,192.
+    The last two blocks train. The head is that of the published weights, with 12,288 dimensions;
+    the code's default is wider and has 8,192.
     """
     return TrainConfig(
         model=model_of(
@@ -254,11 +254,11 @@ def boq(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("dino-mix")
 def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make DINO-Mix's recipe, of GaoShuang98/DINO-Mix (Huang et al. 2024): two mixers over DINOv2.
+    """Make DINO-Mix's recipe (GaoShuang98/DINO-Mix, Huang et al. 2024): two mixers over DINOv2.
 
-    The last four blocks train, and the class token and the positions, for its code freezes all else
-    before the blocks. Its code validates on Pitts30k's test set, by which it chooses the best
-    weights; here they are chosen on `--val`.
+    The last four blocks, the class token and the positions train, because its code freezes
+    everything else before the blocks. Its code chooses the best weights by validation on Pitts30k's
+    test set; here they are chosen on `--val`.
     """
     return TrainConfig(
         model=model_of(
@@ -281,11 +281,11 @@ def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("salad-cm")
 def salad_cm(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SALAD-CM's recipe, of serizba/cliquemining (Izquierdo and Civera, ECCV 2024).
+    """Make SALAD-CM's recipe, from serizba/cliquemining (Izquierdo and Civera, ECCV 2024).
 
     It is SALAD's, but half of the places are cliques of MSLS: `--data gsv=DIR msls=DIR`. The code
-    describes MSLS once, by a trained SALAD, and draws its cliques in advance; here the model that
-    trains describes it again before each epoch.
+    describes MSLS once, with a trained SALAD, and draws its cliques in advance; here the model
+    being trained describes it again before each epoch.
     """
     sets = MixtureSet("gsv"), MixtureSet("msls", sampler="cliques")
     return dataclasses.replace(salad(model, preset), mixture=sets)
@@ -293,13 +293,13 @@ def salad_cm(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("sage")
 def sage(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make a recipe for SAGE (Chen et al., ICLR 2026), whose code of training is not published.
+    """Make a recipe for SAGE (Chen et al., ICLR 2026), whose training code is not published.
 
-    The model, a frozen backbone and the kind of sampler are its paper's: a graph of where images
-    are and how alike they look, made anew by the model before each epoch, and cliques that grow in
-    it (`geo-visual`). All else is decided here, as SALAD-CM's: the sets (`--data gsv=DIR
-    msls=DIR`), the batches, the loss, the optimiser and the size of training. `sage+sage-encoder`
-    has the cross-image encoder.
+    The model, a frozen backbone and the kind of sampler are the paper's: a graph of image positions
+    and visual similarity, rebuilt by the model before each epoch, in which cliques grow
+    (`geo-visual`). Everything else is our choice and follows SALAD-CM: the sets (`--data gsv=DIR
+    msls=DIR`), the batches, the loss, the optimiser and the training size. `sage+sage-encoder` has
+    the cross-image encoder.
     """
     backbone = _vit(model, adapter="dynamic-power")
     whole = model_of(model, preset, backbone, "sage", antialias=False, pixels="floats")
@@ -316,10 +316,10 @@ def sage(model: ModelConfig, preset: str) -> TrainConfig:
 def megaloc(model: ModelConfig, preset: str) -> TrainConfig:
     """Make an open recipe for MegaLoc (Berton and Masone 2025), whose code is not published.
 
-    Its paper adds the losses of six sub-batches of 32 places: of GSV-Cities, MSLS (cliques),
+    Its paper adds the losses of six sub-batches of 32 places: GSV-Cities, MSLS (cliques),
     MegaScenes, ScanNet, and San Francisco XL twice (EigenPlaces' lateral and frontal classes), as
     `--data gsv=DIR msls=DIR megascenes=DIR scannet=DIR lateral=DIR frontal=DIR`, or some of them.
-    Quadruplets of MegaScenes and ScanNet are chosen there by views that overlap; here they are
+    The paper chooses quadruplets of MegaScenes and ScanNet by overlapping views; here they are
     places of a table. The optimiser, what trains and the epochs are SALAD's.
     """
     whole = model_of(

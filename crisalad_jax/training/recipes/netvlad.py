@@ -13,7 +13,7 @@ from crisalad_jax.training.recipes.base import model_of, register_recipe
 from crisalad_jax.training.schedules import MilestonesSchedule, StepSchedule
 
 MARGIN = 0.1**0.5
-"""The code squares distances in its mind: the root of 0.1 is the margin of Euclidean ones."""
+"""The code's margin of 0.1 is for squared distances; its root is that of Euclidean ones."""
 _SGD = OptimiserConfig(
     kind="sgd", learning_rate=1e-4, schedule=StepSchedule(epochs=5), weight_decay=1e-3
 )
@@ -26,16 +26,16 @@ def _model(model: ModelConfig, preset: str, **head: Any) -> ModelConfig:
 
 @register_recipe("netvlad")
 def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make NetVLAD's recipe, of Nanne/pytorch-NetVlad: tuples mined in pitts30k_train.mat.
+    """Make NetVLAD's recipe, from Nanne/pytorch-NetVlad: tuples mined in pitts30k_train.mat.
 
-    VGG-16 trains its last stage. 4 tuples of 12 images make a batch. Every 1,000 queries all images
-    are described anew, and each query takes the 10 hardest of 1,000 random negatives and its last
-    ones, if they violate the margin.
+    VGG-16 trains its last stage. A batch is 4 tuples of 12 images. Every 1,000 queries all images
+    are described again, and each query takes the 10 hardest of 1,000 random negatives and its
+    previous ones, if they violate the margin.
 
-    Its schedule steps before an epoch and not after: the first four epochs have the whole learning
+    Its schedule steps before an epoch, not after it: the first four epochs have the full learning
     rate. It stops after more than 10 epochs without gain. It draws a round's queries from a fixed
-    part of the file; here all are shuffled. Its loader's processes forget a query's last negatives
-    with each round, which the paper keeps, as is done here.
+    part of the file; here all are shuffled. Its loader processes lose a query's last negatives with
+    each round; the paper reuses them, and so does this recipe.
     """
     return TrainConfig(
         model=_model(model, preset),
@@ -55,15 +55,15 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("patch-netvlad")
 def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of Patch-NetVLAD's Mapillary weights: NetVLAD's, of 16 clusters, on MSLS.
+    """Make the recipe of Patch-NetVLAD's Mapillary weights: NetVLAD's, with 16 clusters, on MSLS.
 
     Tuples have 5 negatives, the hardest of 1,000 for all queries of a round. The learning rate
     falls after every fifth epoch.
 
-    The code draws queries with replacement, those at night or sideways more often; here each has
-    its turn. It leaves out candidates near any query of a round, here those near the tuple's own.
-    It looks for violations by inner products with a sign that nearly every query passes; here every
-    one does. Re-ranking by patches learns nothing, and `crisalad pca` fits the whitening.
+    The code draws queries with replacement, those at night or sideways more often; here each is
+    used in turn. It leaves out candidates near any query of a round; here, those near the tuple's
+    own. Its test for violations compares inner products with a sign that nearly every query passes;
+    here every one does. Patch re-ranking learns nothing; `crisalad pca` fits the whitening.
     """
     return dataclasses.replace(
         netvlad(model, preset),
@@ -76,7 +76,7 @@ def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("netvlad-gsv")
 def netvlad_gsv(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make NetVLAD's network and optimiser for places of GSV-Cities.
+    """Make a recipe of NetVLAD's network and optimiser for places of GSV-Cities.
 
     Batches, loss and augmentation are CriSALAD's, as for all methods of the paper's Table 1.
     """

@@ -1,4 +1,4 @@
-"""CriSALAD, as the paper trains it (section 4.2), rows of its Table 2, and `scratch`."""
+"""CriSALAD as the paper trains it (section 4.2), rows of its Table 2, and `scratch`."""
 
 import dataclasses
 
@@ -31,5 +31,5 @@ def crisalad_step(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("scratch")
 def scratch(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe for training all of a model from random weights: ours, for `tiny`."""
+    """Make our recipe for training a whole model from random weights, the default for `tiny`."""
     return from_scratch(TrainConfig(model=model))
