@@ -26,7 +26,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     """Train on places, each with several images; resume the run in OUT if there is one."""
 
     data: tuple[pathlib.Path, ...]
-    """Folder with one folder per place, a table name,place[,lat,lon[,heading]] (places.csv in the
+    """Folder with a folder per place, a table name,place[,lat,lon[,heading]] (places.csv in the
     folder, or the file), or Dataframes/ and Images/ of GSV-Cities, here or at an address as in
     s3://bucket/places; for netvlad, patch-netvlad and selavpr, which mine tuples, a training set of
     queries in any layout that `evaluate` reads. Or several sets of places, as NAME=DIR NAME=DIR:
