@@ -127,7 +127,7 @@ def _addresses(model: Published) -> list[str]:
     addresses = mirrors + ([] if model.url is None else [model.url])
     if not addresses:
         raise InputError(
-            f"found no address of its own for {model.file}, expected it as "
+            f"found no separate address for {model.file}, expected it as "
             f"{_folder(model) / model.file} (download it by hand from {model.repository}: "
             f"{model.note})"
         )

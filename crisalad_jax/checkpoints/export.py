@@ -52,8 +52,8 @@ FORMATS = ("stablehlo", *engines.FORMATS)
 TOLERANCE = 1e-5
 """Largest difference between an exported program's descriptors and `describe`'s, of length 1."""
 GROUPINGS = {
-    "single": "every image is described alone",
-    "batch": "the images of a call look at each other",
+    "single": "every image is described independently",
+    "batch": "the images of a call attend to each other",
     "any": "images are described together as a mask says",
 }
 _SOURCES = "jax_traceback_in_locations_limit"
@@ -275,7 +275,7 @@ def write_export(
         size = " x ".join(map(str, config.input_size))
         warn(
             f"{out}: found images of size rule {config.preprocessing.size_rule}; the program takes "
-            f"{size} alone"
+            f"only {size}"
         )
     with atomic_folder(out) as folder:
         if how.format == "stablehlo":
@@ -433,7 +433,7 @@ def _images(config: ModelConfig, how: ExportConfig) -> dict[str, Any]:
     fixed = dataclasses.replace(chain, size_rule="fixed", round_to_patch=False)
     values = {
         "shape": [how.batch_size or "batch", *_sides(config, how)],
-        "resize": f"{fixed.in_words(size)}, aspect ratio not kept",
+        "resize": f"{fixed.in_words(size)}, aspect ratio not preserved",
     }
     layout = f"RGB, {'by channel, ' if how.for_colmap else ''}rows from the top,"
     if _takes_bytes(config, how):

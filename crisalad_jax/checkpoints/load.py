@@ -90,8 +90,8 @@ def find_weights(
     """
     if weights is None:
         warn(
-            f"no --weights: taking {starter.NAME}, the small model in this package, trained on "
-            f"rendered pictures alone (docs/{starter.NAME}.md); for the best recall: --weights "
+            f"no --weights: taking {starter.NAME}, the small model in this package, trained "
+            f"only on rendered images (docs/{starter.NAME}.md); for the best recall: --weights "
             f"{starter.BEST}"
         )
         return starter.FILE

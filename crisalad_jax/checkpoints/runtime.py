@@ -399,7 +399,7 @@ def _exported(
     folder = user_cache() / "exports" / key[:32]
     refusal = folder.with_suffix(".txt")
     if refusal.is_file():  # otherwise each query would try again, for seconds
-        raise NotExportableError(f"{refusal.read_text('utf-8')} (kept in {refusal})")
+        raise NotExportableError(f"{refusal.read_text('utf-8')} (stored in {refusal})")
     if not (folder / MANIFEST).is_file():
         _check_fixed(weights, model["preprocessing"]["size_rule"])
         with lock(folder.parent, wait=wait):

@@ -20,7 +20,7 @@ from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 DECLARED = "crisalad-jax"
 """Key of the description of the model in public checkpoints that we write. It is in the metadata of
 the state, which other programs ignore."""
-HOW = "torch.save(model.state_dict(), FILE) writes a file of the weights alone"
+HOW = "torch.save(model.state_dict(), FILE) writes a file of only the weights"
 _UNDER = ("state_dict", "model_state_dict", "model", "teacher")
 """Keys under which files store the state."""
 _PCA = ("mean_", "components_", "explained_variance_")
@@ -143,7 +143,7 @@ def _whitening(path: pathlib.Path, whole: Mapping[str, Any]) -> dict[str, np.nda
             raise InputError(f"{path}: model_options: found {name}, expected it to be off")
     if len(found) != 1 and _PCA_NAME not in found:
         names = few(sorted(map(str, found)))
-        raise InputError(f"{path}: pca: found {names}, expected {_PCA_NAME}, or one alone")
+        raise InputError(f"{path}: pca: found {names}, expected {_PCA_NAME}, or only one")
     pca = found.get(_PCA_NAME, next(iter(found.values())))
     of_class = getattr(pca, "stands_for", None)
     if of_class in _PCA_CLASSES:
@@ -209,7 +209,7 @@ def _load(path: pathlib.Path) -> Any:
         if isinstance(error, pickle.UnpicklingError):
             # Torch's message is a page of advice on how to run the code anyway: shorten it.
             refused = re.search(r"(?:GLOBAL|Unsupported \w+) ([a-zA-Z_][\w.]*)", str(error))
-            what = f"asks for {refused[1]}" if refused else "is no plain pickle of tensors"
+            what = f"asks for {refused[1]}" if refused else "is not a plain pickle of tensors"
             problem = f"refused: it {what}, expected nothing but tensors, which run no code: {HOW}"
         raise InputError(f"{path}: {problem}") from error
 
@@ -264,7 +264,7 @@ def _array(path: pathlib.Path, name: str, tensor: Any) -> np.ndarray:
         half = str(tensor.dtype) in ("torch.float16", "torch.bfloat16")
         return (tensor.float() if half else tensor).detach().numpy()
     except (AttributeError, TypeError, RuntimeError) as error:  # sparse, 8-bit or meta tensors
-        raise InputError(f"{path}: {name} is no plain tensor: {error}") from error
+        raise InputError(f"{path}: {name} is not a plain tensor: {error}") from error
 
 
 def write_torch(

@@ -52,7 +52,7 @@ def _facts(model: Published) -> dict[str, Any]:
 
 
 _NOTES = {
-    starter.NAME: f"trained on rendered pictures alone (docs/{starter.NAME}.md)",
+    starter.NAME: f"trained only on rendered images (docs/{starter.NAME}.md)",
     "hog": "a baseline that learns nothing: histograms of oriented gradients",
     "thumbnail": "a baseline that learns nothing: SeqSLAM's small grey images",
 }

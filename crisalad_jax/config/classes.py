@@ -48,5 +48,5 @@ class ClassesConfig:
         require(
             360 % turn == 0,
             f"ClassesConfig.sector: found {self.sector_spacing} sectors of {self.sector:g} degrees,"
-            " expected a divisor of 360 degrees: the last sector lies beside the first",
+            " expected a divisor of 360 degrees: the last sector is next to the first",
         )

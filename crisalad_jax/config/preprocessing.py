@@ -87,7 +87,7 @@ class PreprocessingConfig:
             require(
                 self.pixels == "bytes",
                 f"PreprocessingConfig.pixels: found {self.pixels} with normalisation "
-                f"{self.normalisation}, which is of bytes alone, expected bytes",
+                f"{self.normalisation}, which is only for bytes, expected bytes",
             )
             return
         require(

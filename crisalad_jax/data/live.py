@@ -331,7 +331,7 @@ class Camera(LatestFrame):
         if self._failure is not None:
             raise self._failure
         if not self._is_file and not self._closing.is_set():
-            raise InputError(f"camera: found no more frames from {self.name}, expected it to go on")
+            raise InputError(f"camera: found no more frames from {self.name}, expected more")
 
     def _play(self) -> None:
         """Put frames until there are no more; those of a file at their times."""

@@ -20,7 +20,7 @@ class Difference(NamedTuple):
     interval: Interval
     """95 % interval of the difference, over queries and seeds."""
 
-    verdict: Literal["better", "worse", "not told apart"]
+    verdict: Literal["better", "worse", "inconclusive"]
     """What the interval shows: "better" or "worse" if it excludes 0."""
 
 
@@ -76,7 +76,7 @@ def paired_difference(
     differences = (weights * ours).sum(axis=1) - (other * theirs).sum(axis=1)
     # Sums that are equal in exact arithmetic must not differ by rounding.
     low, high = np.quantile(differences.round(12), (0.025, 0.975))
-    verdict = "better" if low > 0 else "worse" if high < 0 else "not told apart"
+    verdict = "better" if low > 0 else "worse" if high < 0 else "inconclusive"
     mean = float(hits.mean() - reference.mean())
     return Difference(mean, Interval(float(low), float(high)), verdict)
 

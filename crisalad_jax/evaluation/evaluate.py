@@ -124,7 +124,7 @@ def evaluate(
         if rerank.needs_model and rerank.model is None:
             if not isinstance(model, tuple):
                 raise InputError(
-                    "rerank: found another engine, expected weights of its own (--rerank-weights)"
+                    "rerank: found another engine, expected separate weights (--rerank-weights)"
                 )
             rerank = dataclasses.replace(rerank, model=model)
     benchmark.ground_truth()  # fails before any work if there is none

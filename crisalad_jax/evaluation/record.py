@@ -17,7 +17,7 @@ from crisalad_jax.retrieval.grouping import Grouping, grouping_words
 _RECALLS = (
     "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
     "AP: area under precision and recall of the first retrievals, by similarity. R at 100 % P: of "
-    "the queries with a positive, the share retrieved rightly, above every wrong first retrieval."
+    "the queries with a positive, the share with a correct first retrieval above every wrong one."
 )
 
 
@@ -109,11 +109,11 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
     parsed = [Grouping.parse(each.grouping) for each in results if each.grouping != ANY]
     kinds = dict.fromkeys(kind for each in parsed for kind in (each.queries, each.database))
     if kinds:
-        sized = "; after @ a size of its own" if any(each.batch_size for each in parsed) else ""
+        sized = "; after @ a separate size" if any(each.batch_size for each in parsed) else ""
         notes.append(
             "A descriptor of this model depends on the images in its batch of "
             f"{settings['batch_size']}{sized}: {grouping_words(kinds)}. Same place: of the others "
-            f"in sight, those that show the image's own place, told by {settings['same_place']}. "
+            f"in sight, those that show the image's own place, by {settings['same_place']}. "
             "Mirrored: of the others in a query's batch, those whose place is also in the batch of "
             "its right answer. Of what both see a descriptor knows the stretch of files."
         )

@@ -166,7 +166,7 @@ def adapt(
     grouping: Any = {"place_radius": radius} if is_placed else {"place_frames": place_frames}
     split = split_images(sources, config.seed, **grouping)
     count = len(split.training.names)
-    require(count > 1, f"{folder}: found images of {count} place, expected several to tell apart")
+    require(count > 1, f"{folder}: found images of {count} place, expected several")
     # Neighbours never share a batch; half of the separate places leaves the sampler a choice.
     batch = min(config.places_per_batch, max(2, count_apart(split.training) // 2))
     config = dataclasses.replace(config, places_per_batch=batch)

@@ -63,7 +63,7 @@ def split_images(
         InputError: the map has one image, or no place is left.
     """
     source, inside = join_sources(sources), len(sources[0].names)
-    require(inside > 1, f"{source.root}: found a map of one image, expected several to tell apart")
+    require(inside > 1, f"{source.root}: found a map of one image, expected several")
     if place_radius is not None:
         near, rule = _near(source, place_radius), f"at most {place_radius:g} m away"
     elif place_frames is not None:

@@ -200,7 +200,7 @@ def _rows(file: str | os.PathLike[str], run: _Run) -> Iterator[_Row]:
 def _card(run: _Run, rows: Sequence[_Row], *, name: str, licence: str, data: str | None) -> str:
     """Write the model card: a YAML header for the hub, and a page for people."""
     config, short = run.config, name.rpartition("/")[2].partition("@")[0]
-    limits = "A descriptor depends on its own image alone."
+    limits = "A descriptor depends only on its own image."
     if config.model.cross_image.attends:
         limits = (
             "Its descriptors depend on the images that are described together "

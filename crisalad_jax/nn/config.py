@@ -79,7 +79,7 @@ class ModelConfig:
                 f"backbone: found {backbone.part_name} for {aggregator}, expected one with {what}",
             )
         fits = self.preprocessing.size_rule == "fixed" or not self.aggregator.fixed_grid
-        words = f"fixed: {aggregator} has parameters for every patch, of images of one size alone"
+        words = f"fixed: {aggregator} has parameters for every patch, so all images need one size"
         require_field(self.preprocessing, "size_rule", fits, words)
         how, as_bytes = self.preprocessing, ("bytes", (0.0,) * 3, (1 / 255,) * 3)
         require(
@@ -100,7 +100,7 @@ class ModelConfig:
         length, rest = self.unprojected_dim, 0 if cuts or not whole else global_dim % dim
         for name, fits, expected in (
             ("width", not cuts or length % self.sequence_dim == 0, f"a divisor of {length}"),
-            ("global_token", rest == 0, f"False: its width is no multiple of {dim}"),
+            ("global_token", rest == 0, f"False: its width is not a multiple of {dim}"),
             ("global_token", whole or tokens > 0, "True, or no encoder: it is the only token"),
         ):
             require_field(encoder, name, fits, expected)
@@ -222,7 +222,7 @@ class ModelConfig:
         require(
             changed.size_rule != "native" or "native" in resize,
             f"--image-size: found {' x '.join(map(str, image_size))} for a model that takes images "
-            "at their own size, expected --resize fixed (or shorter-side, longer-side) beside it",
+            "at their own size, expected --resize fixed (or shorter-side, longer-side) as well",
         )
         config.check_image_size(config.rounded_size(image_size))
         return dataclasses.replace(config, image_size=image_size)

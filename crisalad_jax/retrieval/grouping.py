@@ -15,7 +15,7 @@ from crisalad_jax.config.checks import choose, require
 from crisalad_jax.utils.shapes import Bool, Int64
 
 GROUPINGS = {
-    "single": "every image alone",
+    "single": "each image independently",
     "shuffled": "batches of images in random order",
     "sequential": "batches of images in file order: neighbours help each other",
     "window": "every image with those just before it in file order: what a moving camera has",
@@ -86,7 +86,7 @@ def grouping_words(groupings: Iterable[str]) -> str:
 
     Example:
         >>> grouping_words(["single"])
-        'single = every image alone'
+        'single = each image independently'
     """
     return "; ".join(f"{name} = {_WORDS[name]}" for name in groupings)
 

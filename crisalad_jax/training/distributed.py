@@ -57,7 +57,7 @@ def join_processes(
         is_valid,
         f"processes: found process {index} of {count} with {coordinator}, expected "
         "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, with a port of "
-        "1 to 65535, and an index from 0 and below the count; or auto alone",
+        "1 to 65535, and an index from 0 and below the count; or only auto",
     )
     given: dict[str, Any] = {}
     if coordinator != "auto":

@@ -244,7 +244,7 @@ class _Loop:
             raise
         except Interrupted as stopped:
             self.save()
-            where = f"after step {self.files.record.step}; the same command goes on"
+            where = f"after step {self.files.record.step}; the same command resumes"
             raise Interrupted(stopped.number, where) from None
 
     def _take_rounds(self, steps: int) -> None:

@@ -148,7 +148,7 @@ class _OptaxOptimiser(Optimiser):
             jax.eval_shape(step, {"weight": jax.ShapeDtypeStruct((2, 2), "float32")})
         except Exception as error:
             raise InputError(
-                f"optimiser {self.part_name}: cannot step by a gradient and a schedule alone: "
+                f"optimiser {self.part_name}: cannot step with only a gradient and a schedule: "
                 f"{type(error).__name__}: {one_line(error)}"
             ) from error
 

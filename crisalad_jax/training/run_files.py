@@ -243,7 +243,7 @@ def extend_run(out: pathlib.Path, config: TrainConfig, record: RunRecord) -> Non
         warn(
             f"{out}: the learning rate falls over the whole run, so that it jumps at step "
             f"{record.step}: this is not the run of {config.epochs} epochs at once; "
-            "--optimiser.schedule.decay-steps keeps a fall's length"
+            "--optimiser.schedule.decay-steps fixes the length of the decay"
         )
 
 

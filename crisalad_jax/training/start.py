@@ -165,7 +165,7 @@ def read_start(
         InputError: both are given, or a file cannot be read or does not fit the model.
     """
     both = weights is not None and backbone is not None
-    require(not both, "--backbone: found beside --weights, expected only one of the two")
+    require(not both, "--backbone: found together with --weights, expected only one of the two")
     if weights is not None:
         file = find_weights(weights, quiet=quiet)
         params, theirs = load_weights(file, expected=config.model)

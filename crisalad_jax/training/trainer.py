@@ -59,7 +59,7 @@ class Trainer:
         mesh = self._devices.mesh
         if shard_state and mesh.size == 1:
             raise InputError(
-                "shard_state: found one device to keep the state on, expected several; a CPU's do "
+                "shard_state: found one device for the state, expected several; a CPU's do "
                 "not share a step where all trains"
             )
         self._step_config = step_config(

@@ -125,7 +125,7 @@ def read_text(path: str | os.PathLike[str], expected: str) -> str:
         return read_bytes(path, expected, largest=LARGEST_TEXT).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: found bytes that are no UTF-8 (at {error.start}), expected {expected}"
+            f"{path}: found bytes that are not UTF-8 (at {error.start}), expected {expected}"
         ) from error
 
 

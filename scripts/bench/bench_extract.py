@@ -3,8 +3,8 @@
     python scripts/bench/bench_extract.py [--page docs/performance-studies.md]
         [--presets s14 ...] [--images 2000] [--batch 16]
 
-Ours is what `crisalad extract` does: list, decode, resize, describe (every image alone) over the
-CPU's devices, write. The other side is how it is done in torch: a Dataset that reads and normalises
+Ours is what `crisalad extract` does: list, decode, resize, describe (independently) over the CPU's
+devices, write. The other side is how it is done in torch: a Dataset that reads and normalises
 an image, a DataLoader with a worker for each core, the reference of the parity checks through
 torch.compile in inference mode, numpy; or through ONNX Runtime or OpenVINO, of the file that torch
 writes. All have the same random weights, and the same functions decode, resize and write. The

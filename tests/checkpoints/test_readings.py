@@ -191,7 +191,7 @@ def test_nothing_of_a_file_is_run(tmp_path: pathlib.Path) -> None:
     assert not (tmp_path / "made").exists()
 
 
-HOW = r"torch\.save\(model\.state_dict\(\), FILE\) writes a file of the weights alone"
+HOW = r"torch\.save\(model\.state_dict\(\), FILE\) writes a file of only the weights"
 
 
 @pytest.mark.parametrize("under", [None, "model"])

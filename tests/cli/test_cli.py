@@ -507,7 +507,8 @@ def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, b
     )
     assert "town/test (@UTM, 25 m): 5 queries, 7 database images; positive: UTM distance" in out
     # The customer is told that a descriptor depends on its batch.
-    assert f"depends on the images in its batch of {BATCH}: single = every image alone" in out
+    words = f"depends on the images in its batch of {BATCH}: single = each image independently"
+    assert words in out
     table = json.loads((tmp_path / "table.json").read_text())
     reading = Reading(batch_size=BATCH, quiet=True)
     expected = evaluate(Model(params, MODEL), benchmark, seed=3, seeds=2, reading=reading)
@@ -600,7 +601,7 @@ def test_extract_writes_descriptors_names_and_configuration(
 ):
     town = shared / "town"
     out = succeeds(capfd, *extract(shared, town, tmp_path / "new" / "d.npy"))
-    assert "12 descriptors of 48 numbers, grouping single (every image alone)" in out
+    assert "12 descriptors of 48 numbers, grouping single (each image independently)" in out
     assert files_in(tmp_path / "new") == {"d.npy", "d.names.txt", "d.npy.json"}
     names = (tmp_path / "new" / "d.names.txt").read_text().splitlines()
     assert names == sorted(path.relative_to(town).as_posix() for path in town.rglob("*.jpg"))

@@ -23,7 +23,7 @@ def test_flags_become_the_manifest(tmp_path, capfd, weights):
     assert manifest["platforms"] == ["cpu"]
     assert said == (
         f"{out}: images uint8 (2, 56, 42, 3) -> descriptors float32 (2, 48); "
-        "the images of a call look at each other; weights inside; for cpu"
+        "the images of a call attend to each other; weights inside; for cpu"
     )
 
 

@@ -59,8 +59,8 @@ def test_notes_are_of_what_the_table_shows(record):
     alone = table_notes([result(ANY)], settings)
     assert alone[1:] == ["No cross-image encoder: no descriptor depends on its batch."]
     _, grouped = table_notes([result("single"), result("window/single")], settings)
-    assert f"in its batch of {BATCH}: single = every image alone; window = every" in grouped
-    assert "told by a distance of at most 25 m" in grouped
+    assert f"in its batch of {BATCH}: single = each image independently; window = every" in grouped
+    assert "place, by a distance of at most 25 m" in grouped
     results = [result("shuffled"), result("shuffled", "transvpr:3")]
     *_, shuffled, ranked = table_notes(results, settings)
     assert shuffled.startswith("Shuffled: mean of 2 seeds ± their standard deviation")

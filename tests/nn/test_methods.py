@@ -175,7 +175,7 @@ def test_mixvpr_describes_images_of_its_own_size_alone() -> None:
     for size in ((56, 42), (84, 84)):
         words = (
             f"^image size: found {size[0]} x {size[1]}, expected 42 x 56: aggregator mixvpr has "
-            "parameters for every patch, and was made for images of this size alone"
+            "parameters for every patch, and was made for images of this size only"
         )
         with pytest.raises(InputError, match=words):
             config.check_image_size(size)

@@ -41,7 +41,7 @@ def test_a_signal_saves_first_and_the_same_command_goes_on(
 
     with monkeypatch.context() as patch:
         patch.setattr(module, function, signalled)
-        words = f"after step {saved}; the same command goes on"
+        words = f"after step {saved}; the same command resumes"
         with pytest.raises(Interrupted, match=words) as stopped:
             fit(ENDLESS, places, tmp_path / "run", **given)
     assert stopped.value.number == number

@@ -63,7 +63,7 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
     wrong = differences(_shown(with_non_semantic_fields_of(config, read_back)), _shown(config))
     if wrong:
         raise InputError(
-            f"format {name}: cannot tell these apart from the published ones: "
+            f"format {name}: these cannot be distinguished from the published ones: "
             f"{'; '.join(wrong)} (format {REFERENCE} can)"
         )
     return read_back

@@ -76,7 +76,7 @@ def read_folders(
         positives = within(places, asked, radius)
         truth, rule = f"{radius:g} m", f"a distance of at most {radius:g} m"
     else:
-        positives, truth, rule = None, "no ground truth", "none: there is no ground truth"
+        positives, truth, rule = None, "no ground truth", "none: no ground truth was found"
     name = f"{name} (two folders, {truth})"
     return Benchmark(name, root, database, queries, positives, rule, places, asked, radius)
 

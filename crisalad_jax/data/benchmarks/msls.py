@@ -182,7 +182,7 @@ def read_side(
         if row.fields["pano"] == "False" and (not subtask or mark.fields["all"] == "True")
     ]
     if not kept:
-        raise InputError(f"{folder}: found {len(raw)} images, expected some that are no panoramas")
+        raise InputError(f"{folder}: found {len(raw)} images, expected some that are not panoramas")
     names = [f"{row.fields['key']}.jpg" for row, _ in kept]
     images = find_images(folder / "raw.csv", names, folder / "images", on_bad_image)
     metres = np.array([[place.number("easting"), place.number("northing")] for _, place in kept])

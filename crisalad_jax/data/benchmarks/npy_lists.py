@@ -117,7 +117,7 @@ def read_salad_lists(
         names["qImages"] = [names["qImages"][query] for query in chosen]
     asked = len(names["qImages"])
     truth = files.get("gt", files.get("pIdx"))
-    positives, rule = None, "none: there is no ground truth beside the lists"
+    positives, rule = None, "none: no ground truth was found next to the lists"
     if truth is not None:
         positives = _read_matches(truth, _read_rows(truth, asked), count)
         rule = f"the database images that {truth.name} lists"

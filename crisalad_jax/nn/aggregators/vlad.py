@@ -339,7 +339,7 @@ def fit_reduction(features: FeatureRows, reduced: int) -> Reduction:
     require(
         min(features.shape) >= reduced,
         f"features: found {features.shape[0]} of width {features.shape[1]}, expected at least "
-        f"{reduced} of each, one for each component that VLAD-BuFF keeps",
+        f"{reduced} of each, one for each component of VLAD-BuFF",
     )
     mean = features.mean(axis=0)
     centred = features - mean

@@ -73,7 +73,7 @@ class FeatureSpec:
         require(
             in_order and (self.facet == "token" or len(levels) == 1),
             f"levels: found {levels} of facet {self.facet}, expected numbers of blocks in order, 1 "
-            f"to {depth}, and one alone of a facet of attention",
+            f"to {depth}, and only one for a facet of attention",
         )
         return levels
 

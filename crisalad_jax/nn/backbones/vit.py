@@ -490,7 +490,7 @@ def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[in
     if request.class_attention:
         special["adapters with prompts"] = config.adapter.has("prompts")
     found = [name for name, is_asked in special.items() if is_asked]
-    require(len(found) < 2, f"features: found {' and '.join(found)}, expected one of these alone")
+    require(len(found) < 2, f"features: found {' and '.join(found)}, expected only one of these")
     return levels
 
 

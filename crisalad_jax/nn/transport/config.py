@@ -82,13 +82,13 @@ class SinkhornConfig:
         resolve_names(self)
         gradient, converges = self.gradient, self.tolerance is not None
         remembers = self.anderson_memory > 1 and not gradient.takes_solver
-        memory = "0; or a whole number from 2, with a gradient that takes no solver of its own"
+        memory = "0; or a whole number from 2, with a gradient without its own solver"
         mode = "a fixed number of iterations, without a tolerance" if converges else "a tolerance"
         step = f"a step that says it solves the entropic problem, not {self.step.part_name!r}"
         for name, fits, expected in (
             ("anderson_memory", self.anderson_memory == 0 or remembers, memory),
             ("throw", converges or not self.throw, "a tolerance to converge to"),
-            ("gradient", gradient.at_convergence in (None, converges), f"{mode} beside it"),
+            ("gradient", gradient.at_convergence in (None, converges), f"{mode} with it"),
             ("gradient", self.step.entropic or not gradient.needs_entropic, step),
         ):
             require_field(self, name, fits, expected)

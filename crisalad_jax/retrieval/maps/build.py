@@ -246,7 +246,7 @@ def index(
         result = result._replace(similar=rest)
     if result.added == result.images and describer.config.cross_image.attends:
         warn(
-            f"{out}: a map describes each image alone, and this model attends across images: "
+            f"{out}: a map describes images independently, and this model attends across them: "
             "recalls that are published for batches are not the map's (`crisalad evaluate "
             "--grouping single` measures those of single images)"
         )

@@ -96,7 +96,7 @@ def check_address(address: str) -> bool:
         if "@" in urllib.parse.urlsplit(address).netloc:
             raise InputError(
                 "store: found a user's name in the address, expected it in the environment "
-                f"variable {TOKEN}, which no file keeps"
+                f"variable {TOKEN}, which no file stores"
             )
         return True
     if "://" in address or not address.endswith(".db"):

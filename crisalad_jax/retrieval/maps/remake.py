@@ -102,7 +102,7 @@ def check_remakeable(folder: str | os.PathLike[str]) -> MapMetadata:
     others = sorted(found - own)
     require(
         not others,
-        f"{folder}: found {', '.join(others)} beside the map, expected the map alone ({advice})",
+        f"{folder}: found {', '.join(others)} in the folder, expected only the map ({advice})",
     )
     return metadata
 
@@ -179,5 +179,5 @@ def remake_map(
                 target.build_search(kind, quiet=reading.quiet)
         exchange(new, folder)  # the old map, now called `new`, is removed
     if calibrated:
-        warn(f"{folder}: its least similarity is no longer known; `crisalad calibrate` measures it")
+        warn(f"{folder}: its threshold is no longer known; `crisalad calibrate` measures it")
     return count

@@ -258,7 +258,7 @@ _BODY = {
     }
 }
 _PROBLEM: dict[int | str, dict[str, Any]] = {
-    "default": {"model": Problem, "description": "Why there is no answer, in one line"}
+    "default": {"model": Problem, "description": "The reason for the missing answer, in one line"}
 }
 _Bearer = Annotated[
     HTTPAuthorizationCredentials | None, fastapi.Depends(HTTPBearer(auto_error=False))

@@ -64,7 +64,7 @@ def test_runs_that_agree_have_no_difference():
 
 @pytest.mark.parametrize(
     ("ours", "theirs", "verdict"),
-    [(40, 10, "better"), (10, 40, "worse"), (25, 25, "not told apart"), (26, 25, "not told apart")],
+    [(40, 10, "better"), (10, 40, "worse"), (25, 25, "inconclusive"), (26, 25, "inconclusive")],
 )
 def test_what_an_interval_decides(ours, theirs, verdict):
     """One more hit of 50 is 0 in a resample that draws that query not once, as a third do."""

@@ -167,7 +167,7 @@ def test_a_table_in_a_page(tmp_path):
 
 
 BETTER = Difference(0.0449, Interval(0.004, 0.0861), "better")
-UNTOLD = Difference(-0.0001, Interval(-0.1, 0.1), "not told apart")
+UNTOLD = Difference(-0.0001, Interval(-0.1, 0.1), "inconclusive")
 WORSE = Difference(-0.25, Interval(-0.5, -0.01), "worse")
 DIFFERENCES = {1: BETTER, 5: UNTOLD, 10: WORSE}
 DIFFERENT = {k: LONE._replace(difference=each) for k, each in DIFFERENCES.items()}
@@ -183,11 +183,11 @@ def test_differences_in_markdown_csv_and_json(tmp_path):
     assert tables.markdown(COMPARED).splitlines()[5:8] == [
         "| method, less First | town Δ R@1 | town Δ R@5 | town Δ R@10 |",
         "| --- | ---: | ---: | ---: |",
-        "| Other | +4.5 (+0.4 to +8.6) better | +0.0 (-10.0 to +10.0) not told apart "
+        "| Other | +4.5 (+0.4 to +8.6) better | +0.0 (-10.0 to +10.0) inconclusive "
         "| -25.0 (-50.0 to -1.0) worse |",
     ]
     lines = written(COMPARED, tmp_path)
-    verdicts = ["", "", "", "better", "not told apart", "worse"]
+    verdicts = ["", "", "", "better", "inconclusive", "worse"]
     assert [line["verdict"] for line in lines] == verdicts
     names = ("difference", "difference_low", "difference_high")
     assert [lines[3][name] for name in names] == ["0.0449", "0.004", "0.0861"]

@@ -166,7 +166,9 @@ def test_a_new_map_of_a_model_that_attends_across_images_says_so(params, databas
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             index_folder(tmp_path / f"map{len(options)}", params, images, **options)
-        words = ": a map describes each image alone, and this model attends across images: recalls"
+        words = (
+            ": a map describes images independently, and this model attends across them: recalls"
+        )
         return sum(words in str(each.message) for each in caught)
 
     first = list_images(database)[0]
