@@ -52,7 +52,7 @@ class ModelConfig:
     float64 is for numerical studies, under JAX's 64-bit mode."""
     precision: Literal["highest", "high", "default"] = non_semantic_field("highest")
     """Precision of float32 products on accelerators, as JAX names it: "highest" is float32,
-    "high" fewer bits, and "default" the platform's fastest (docs/performance.md). A CPU
+    "high" fewer bits, and "default" the platform's fastest (docs/accelerators.md). A CPU
     computes in float32. Products of another `compute_dtype` are in that type."""
     remat: Literal["dots", "full", "none"] = non_semantic_field("dots")
     """Rematerialisation of a block in the backward pass. "dots" stores the results of large matrix
