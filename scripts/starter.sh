@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Sets up what is missing and makes the model in the package again: renders 24,000 places, trains
-# on them twice, and whitens. About four hours on two cores; the same command goes on where it was.
+# on them twice, and whitens. About four hours on two cores; the same command resumes.
 set -euo pipefail
 usage="usage: bash scripts/starter.sh [OUT [VAL]]"
 case "${1:-}" in -h | --help) echo "$usage"; exit ;; esac
