@@ -5,7 +5,7 @@ The problem is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo 
 (patches), K columns (clusters, and the dustbin last), which runs faster than the published (K, N).
 `docs/sinkhorn.md` says when to use which variant, and gives the equations.
 
-Register a custom step, dustbin or gradient as the built-in ones are:
+Register a custom step, dustbin, gradient or start like the built-in ones:
 
     @register_step("capacity")
     def capacity(problem, potentials):

@@ -45,16 +45,15 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
 
     Args:
         model: the published model.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         A file of this package.
 
     Raises:
         InputError: what `download` and `read_checkpoint` raise; the file differs from the first
-            download, or is not this model; it is not here and the network is disabled, or it has no
-            address of its own; torch is needed but not installed; or the cache cannot be written
-            to.
+            download, or is not this model; it is missing, and the network is disabled or it has no
+            address; torch is needed but not installed; or the cache cannot be written to.
     """
     if not _is_ready(model):
         try:
@@ -159,7 +158,7 @@ def _convert(
         model: the model.
         published: its file.
         address: where it was downloaded from just now; None if the file was there before.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Raises:
         InputError: the file is not the recorded one, or not the model.

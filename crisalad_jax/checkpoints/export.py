@@ -76,9 +76,8 @@ class ExportConfig:
     """
 
     grouping: Literal["single", "batch", "any"] = "single"
-    """Grouping of a call's images in the cross-image encoder: each independently, or all of them.
-    "any" is two programs of ONNX or OpenVINO: images to tokens, and tokens to descriptors, with a
-    mask of which image attends to which."""
+    """How a call's images attend to each other: "single", not at all; "batch", all to all; "any",
+    by a mask, in two programs of ONNX or OpenVINO: images to tokens, and these to descriptors."""
     batch_size: int | None = None
     """Number of images in a call; None allows any number (a symbolic dimension)."""
     weights_inside: bool = False
@@ -88,11 +87,11 @@ class ExportConfig:
     format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
     """StableHLO, which JAX runs; ONNX, which most engines read; or OpenVINO's own."""
     pixels: Literal["bytes", "floats"] | None = None
-    """8-bit pixels, which the program normalises, or normalised floats; None is what the model
-    resizes."""
+    """8-bit pixels, which the program normalises, or normalised floats; None takes the type that
+    the model resizes."""
     for_colmap: bool = False
-    """Whether an ONNX program has the inputs and outputs that COLMAP's draft of retrieval by global
-    descriptors reads: normalised floats (batch, 3, height, width) to `descriptor`."""
+    """Whether an ONNX program has the inputs and outputs of COLMAP's draft of global-descriptor
+    retrieval: normalised floats (batch, 3, height, width) to `descriptor`."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -241,8 +240,7 @@ def write_export(
         model: parameters and configuration.
         how: format, platforms, batch size and grouping.
         calibration: prepared images with which onnxruntime quantises products to int8, for ONNX and
-            OpenVINO; None leaves float32. Descriptors then differ, and the manifest says by how
-            much.
+            OpenVINO. The manifest says how much descriptors then differ. None leaves float32.
 
     Returns:
         The content of manifest.json.

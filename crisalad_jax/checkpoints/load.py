@@ -63,16 +63,16 @@ def find_weights(
 ) -> pathlib.Path:
     """Find the weight file for a path, or for the name of a published model.
 
-    None is the small model in this package, "starter", with a note. Other names are "hog" and
+    None is the small model in this package, "starter", with a warning. Other names are "hog" and
     "thumbnail", baselines that learn nothing. A published model is downloaded the first time. Its
     licence is shown each time, or once if it forbids commercial use, because its file says so too.
-    A file of such a name in the working directory takes precedence, with a note.
+    A file of such a name in the working directory takes precedence, with a warning.
 
     Args:
         weights: a path, a name from `crisalad models`, or None; or hf://OWNER/NAME for a file at
             Hugging Face's hub; or a folder with the layout of one at the hub.
         engine: any but "jax" also accepts the folder of an exported model, "auto" if it is one.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The path; for a name, a file of this package in the cache; for the hub, one in its cache.
@@ -166,7 +166,7 @@ def open_model(
             folder.
         engine: "jax", "onnxruntime" or "openvino".
         changed: returns the configuration to describe images with, given the model's.
-        groupings: the groupings that images will be described in.
+        groupings: groupings of the images.
         verify: whether to compare files with their checksums.
         quiet: whether to hide the progress of a download.
 

@@ -239,12 +239,13 @@ def convert(
     """Convert a public checkpoint to a file of this package, or such a file to a public one.
 
     Args:
-        source: what `read_checkpoint` reads.
-        target: for a public source, a .safetensors file. For one of ours, the public checkpoint.
-        format: one of `FORMATS`, for a source of ours; by default the one its parts came from.
+        source: a file that `read_checkpoint` reads.
+        target: the file to write: .safetensors for a public source, else a public checkpoint.
+        format: public format of the target (`FORMATS`), for a source of this package; by default
+            one that can hold the model.
         backbone: the backbone's checkpoint, for a source that is only an AnyLoc vocabulary.
         fields: see `read_vocabulary`.
-        half: whether to write a file of this package in half precision, also from a source of ours;
+        half: whether to write a file of this package in half precision, from either kind of source;
             see `save_weights`.
 
     Returns:
@@ -296,8 +297,8 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     If a ResNet has more stages, the first ones are used.
 
     Args:
-        path: what `load` reads.
-        config: the backbone of the model.
+        path: a file or name that `load` reads.
+        config: configuration of the model's backbone.
         fresh: parameters of such a backbone, whose adapters are used if the file has none.
 
     Returns:
@@ -322,7 +323,7 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     theirs, params = checkpoint.config.backbone, checkpoint.params.backbone
     if type(theirs) is type(config):
         theirs, params = config.adapt_checkpoint(theirs, params, fresh)
-    # Ignore free fields, such as the initialisation: weights do not depend on them.
+    # Ignore non-semantic fields, such as the initialisation: weights do not depend on them.
     wrong = differences(with_non_semantic_fields_of(config, theirs), config, "backbone")
     if wrong:
         raise InputError(f"{path}: this backbone is another than the model's: {'; '.join(wrong)}")

@@ -156,7 +156,7 @@ class Runtime:
         """Compute descriptors from the tokens of groups of images.
 
         Args:
-            rows: from `tokens`, (group, image, number).
+            rows: rows from `tokens`, (group, image, number).
             mask: `mask[g, i, j]` allows image i of group g to attend to image j of it.
 
         Returns:
@@ -357,7 +357,7 @@ def _load(
     *,
     verify: bool,
 ) -> list[Program]:
-    """Load the programs, and compare their files with the checksums meanwhile."""
+    """Load the programs while comparing their files with the checksums."""
     parts = [manifest, manifest[ATTEND]] if ATTEND in manifest else [manifest]
     entries = [part[name] for part in parts for name in ("program", "weights") if part[name]]
     for entry in entries:

@@ -62,7 +62,7 @@ def write_sealed(
 
     Args:
         path: the file.
-        arrays: by name.
+        arrays: arrays by name.
         form: the format and its version, the only key of the metadata, because safetensors does not
             preserve the order of several.
         value: the object, as JSON values.

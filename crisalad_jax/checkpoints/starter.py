@@ -17,7 +17,7 @@ FILE = pathlib.Path(__file__).with_name(f"{NAME}.safetensors")
 FILES = {NAME: FILE, "hog": FILE.with_stem("hog"), "thumbnail": FILE.with_stem("thumbnail")}
 """The files of all models in this package by their names."""
 BEST = "megaloc"
-"""The published model with the best recall, which a note names."""
+"""The published model with the best recall, which a warning names."""
 
 
 def named(weights: str | os.PathLike[str]) -> str:

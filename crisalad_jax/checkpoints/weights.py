@@ -90,7 +90,7 @@ def save_weights(
     """Write parameters under their dotted names, and the configuration in the file's metadata.
 
     Args:
-        path: the file, a .safetensors.
+        path: the .safetensors file.
         model: all parameters, and the configuration.
         extras: arrays of a public checkpoint that no descriptor needs (see `convert`).
         half: whether to store float32 parameters as float16, in half the space. They are rounded,
@@ -149,7 +149,7 @@ def load_weights(
 ) -> Model:
     """Read the model that `save_weights` wrote.
 
-    A note warns if a part's source has changed since the weights were written.
+    Warn if a part's source has changed since the weights were written.
 
     Args:
         path: the file; `find_weights` finds the file of a name.
@@ -251,7 +251,7 @@ def model_hash(params: Crisalad, config: ModelConfig) -> str:
 
     Args:
         params: all parameters of the model.
-        config: the model.
+        config: the model's configuration.
 
     Returns:
         SHA-256 in hexadecimal digits.

@@ -13,7 +13,7 @@ from crisalad_jax.training.recipes import recipe
 
 
 class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
-    """Fit the model of a map to its place: a few steps on its images; resume the run in OUT."""
+    """Adapt a map's model to the map's environment in a few steps; resume the run in OUT."""
 
     map: pathlib.Path
     """Map whose model is adapted; its images must be where they were indexed."""

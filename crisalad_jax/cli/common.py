@@ -273,7 +273,7 @@ def open_flagged(
     Args:
         flags: which model, and how it describes images.
         weights: a file in place of --weights.
-        groupings: the groupings that images will be described in.
+        groupings: groupings of the images.
         like: configuration of a map, whose image size and types the flags then change.
 
     Raises:

@@ -26,9 +26,9 @@ class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14."""
     seeds: int = 3
-    """Runs of each, with seeds 0, 1 and so on."""
+    """Runs of each method, with seeds 0, 1 and so on."""
     epochs: int | None = None
-    """By default the recipes'; from scratch 6."""
+    """Epochs; by default the recipes', from scratch 6."""
     grouping: str = "single"
     """Comma-separated, as `evaluate` takes them, for methods with a cross-image encoder."""
     reference: str | None = None

@@ -33,8 +33,8 @@ class Convert(PluginFlag, JsonFlag):
     """The backbone's checkpoint, or a published model's name, as in dinov2-vitg14: for a vocabulary
     of AnyLoc, which is a single tensor."""
     layer: int | None = None
-    """With --backbone: the vocabulary's block, from 0, or from the end where negative; by default
-    -9, which is 31 of ViT-g's 40."""
+    """With --backbone: the vocabulary's block, from 0, or from the end if negative; by default -9,
+    which is 31 of ViT-g's 40."""
     facet: str | None = None
     """With --backbone: query, key, value or token; by default value."""
     assignment: str | None = None

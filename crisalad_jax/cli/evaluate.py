@@ -42,7 +42,7 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     of its own place), window (an image with those just before it, --batch-size in all);
     QUERIES/DATABASE groups the sides separately, and @26 after it makes batches of 26.
     published:sage, published:cricavpr or published:crisalad: the batches of that evaluation, and
-    then the honest ones."""
+    then single, shuffled and masked ones of that size."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     dtype: Literal["float32", "bits"] = "float32"
@@ -58,7 +58,7 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     """Model that makes these features, as --weights; by default the first stage's. For local, a
     matcher as an ONNX file."""
     precision: float | None = None
-    """Also print the least similarity at which this share of the accepted first retrievals is
+    """Also print the minimum similarity at which this share of the accepted first retrievals is
     correct, such as 0.99, and the remaining recall."""
     seed: int = 0
     """Seed of the first shuffled order and untrained weights."""

@@ -66,14 +66,14 @@ class QuietFlag(Flags):
     """Whether progress is shown."""
 
     quiet: bool = False
-    """No progress bars."""
+    """Hide progress bars."""
 
 
 class DecodeFlags(PluginFlag, QuietFlag):
     """How large an image may be."""
 
     max_pixels: int = 2**28
-    """Most pixels of an image file; larger ones are not decoded."""
+    """Maximum pixels of an image file; larger ones are not decoded."""
     batch_size: int = 16
     """Number of images described together."""
 
@@ -174,8 +174,8 @@ class PositionFlags(Flags):
     start_time: str | None = None
     """When the video began, for a track as --positions: 2026-05-01T12:00:00+02:00."""
     time_offset: float | None = None
-    """Seconds to add to images' times, for a track as --positions: -7200 where the camera's clock
-    is two hours ahead of UTC."""
+    """Seconds to add to images' times, for a track as --positions: -7200 if the camera's clock is
+    two hours ahead of UTC."""
 
 
 class PlaceFlags(PositionFlags):
@@ -198,7 +198,7 @@ class SetFlags(Flags):
     """utm, vpr-bench, netvlad, salad, msls, msls-subtask or folders; by default what DATA looks
     like (msls-subtask, the 740 queries of raw MSLS, only by name)."""
     images: pathlib.Path | None = None
-    """Folder of the images that a .mat file or .npy lists name; by default where it is."""
+    """Folder of the images that a .mat file or .npy lists name; by default the file's."""
     queries: str | None = None
     """Folder of the queries, if a @UTM set has several: queries_night of SVOX; by default
     queries."""

@@ -15,12 +15,12 @@ from crisalad_jax.config.flags import plain_metavar
 
 SHORT, ALL = "--help", "--help-all"
 _WIDTH, _LEAST, _COLUMN = 100, 60, 30
-"""Most and fewest columns of the help, which a narrower terminal wraps, and the most for a flag; a
-wider flag has its text on the next line."""
+"""Maximum and minimum columns of the help, which a narrower terminal wraps, and the maximum for a
+flag; a wider flag has its text on the next line."""
 _RAGGED = 12
 """Columns that a line may leave empty where a long word follows."""
 _CHOICES = 6
-"""Most choices that are shown as a flag's value; more are listed in its text."""
+"""Maximum choices that are shown as a flag's value; more are listed in its text."""
 
 _ENDS = re.compile(r"[.;](?= )|$")
 """Ends of clauses."""

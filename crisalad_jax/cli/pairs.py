@@ -31,9 +31,9 @@ class Pairs(ReadFlags, JsonFlag):
     k: int = 20
     """Each image with its k most similar ones; 0 for none of these."""
     min_similarity: float = -1.0
-    """Least similarity of these."""
+    """Minimum similarity of these."""
     min_gap: float | None = None
-    """Least seconds between these, by the times in their names: loops."""
+    """Minimum seconds between these, by the times in their names: loop closures."""
     overlap: int = 0
     """Also each image with this many next ones of its folder or video."""
     within: float | None = None

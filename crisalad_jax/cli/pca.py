@@ -31,7 +31,7 @@ class Pca(JsonFlag, QuietFlag):
     renormalise: bool = True
     """Make the shorter descriptors unit vectors again."""
     samples: int = SAMPLES
-    """Most descriptors to fit, drawn at random."""
+    """Maximum number of descriptors to fit, drawn at random."""
     seed: int = 0
     """Their seed."""
     checksums: bool = True

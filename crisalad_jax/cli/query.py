@@ -114,7 +114,7 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     """The camera's fx,fy,cx,cy, or with ,width,height, or a file: YAML or JSON of ROS's
     camera_info."""
     map_intrinsics: str | None = None
-    """The same of the camera that took the map's images, if different."""
+    """Intrinsics of the map's camera, if different."""
     map_depth: pathlib.Path | None = None
     """Folder of 16-bit PNGs: depth of the map's images in millimetres, under their names."""
 

@@ -24,7 +24,7 @@ class Serve(DecodeFlags, MapFlags):
     token_file: pathlib.Path | None = None
     """File of the token that requests must send; by default the variable CRISALAD_TOKEN."""
     append: bool = False
-    """Let requests add images to the map; no other process can append meanwhile."""
+    """Let requests add images to the map; no other process can append then."""
     map_images: pathlib.Path | None = None
     """Folder of the map's pictures, if they were moved."""
     runtime: QueryRuntimeName = "auto"
@@ -40,9 +40,9 @@ class Serve(DecodeFlags, MapFlags):
     """local:N verifies the N best answers by local features; local, the first 5
     (docs/verification.md)."""
     max_bytes: int = 20 * 2**20
-    """Most bytes of a request."""
+    """Maximum bytes of a request."""
     max_pixels: int = 2**26
-    """Most pixels of a picture; larger ones are not decoded."""
+    """Maximum pixels of a picture; larger ones are not decoded."""
 
 
 def run(arguments: Serve) -> None:

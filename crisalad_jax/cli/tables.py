@@ -78,7 +78,7 @@ def checked_table(parts: Sequence[CheckedPart]) -> Table:
 
 
 _MOST = 10
-"""Most rows to list for a fact."""
+"""Maximum rows to list for a fact."""
 
 
 def fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:

@@ -35,11 +35,11 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     """Folder of the run."""
     settings: Any
     place_radius: float | None = None
-    """Make places from --data, a source of images with positions (docs/how-to/image-sources.md):
-    images within this many metres of a centre. No batch has two nearby places."""
+    """Radius in metres of places made from --data, a source of images with positions
+    (docs/how-to/image-sources.md). No batch has two nearby places."""
     place_frames: int | None = None
-    """Make each place from this many consecutive images of --data, a folder or video. No batch has
-    two neighbouring places."""
+    """Number of consecutive images of --data, a folder or video, in each place. No batch has two
+    neighbouring places."""
     positions: pathlib.Path | None = None
     """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for --place-radius; by default
     what a table as --data says, or @UTM names, or EXIF data."""
@@ -74,7 +74,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28
-    """Most pixels of an image file; larger ones are not decoded."""
+    """Maximum pixels of an image file; larger ones are not decoded."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; replaces --model.image-size."""
     on_bad_image: Literal["stop", "skip"] = "stop"
@@ -95,7 +95,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     """Shard the trainable parameters and their moments over the devices: for --trainable all of a
     large model."""
     cache_gb: float = CACHE_GB
-    """Most gigabytes of --data at an address (s3://...) that are cached on this host's disk, in
+    """Maximum gigabytes of --data at an address (s3://...) that are cached on this host's disk, in
     CRISALAD_CACHE; processes share it, and 0 caches nothing."""
     callback: tuple[str, ...] = ()
     """Also log steps and validations elsewhere: csv (steps.csv and validations.csv

@@ -32,13 +32,13 @@ class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     clusters: int | None = None
     """Words, if the aggregator has such a setting; by default the preset's."""
     layer: int | None = None
-    """AnyLoc's block, from 0, or from the end where negative; by default the preset's."""
+    """AnyLoc's block, from 0, or from the end if negative; by default the preset's."""
     facet: str | None = None
     """What AnyLoc takes from that block: query, key, value or token; by default its values."""
     assignment: str | None = None
     """How AnyLoc finds the nearest word of a patch: cosine (as published) or euclidean."""
     max_images: int = IMAGES
-    """Most images to read, drawn at random."""
+    """Maximum number of images to read, drawn at random."""
     seed: int = 0
     """Seed of the images, patches of each, first centroids and a random backbone."""
 

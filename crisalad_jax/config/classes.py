@@ -10,7 +10,7 @@ from crisalad_jax.config.short_repr import short_repr
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class ClassesConfig:
-    """Classes of a training set, and the groups that epochs train in turn.
+    """How images form classes, and classes form groups, which epochs train in turn.
 
     The constants are CosPlace's (Berton et al., CVPR 2022); see docs/methods.md.
 
@@ -23,8 +23,8 @@ class ClassesConfig:
     """Kind of class: the training set's own places, CosPlace's cells of position and heading, or
     EigenPlaces' cells of position with a focal point. The latter two need real positions."""
     groups: PositiveInt = 8
-    """Number of groups, those with the most classes; for viewpoints, the number of lateral groups
-    and of frontal groups."""
+    """Number of groups that train, those with the most classes; for viewpoints, this many lateral
+    and this many frontal groups."""
     steps: PositiveInt | None = None
     """Number of steps in an epoch; None passes once over the largest group."""
     cell: PositiveFloat = 10.0
@@ -32,10 +32,10 @@ class ClassesConfig:
     sector: PositiveFloat = 30.0
     """Width of a sector of headings in degrees, CosPlace's alpha."""
     spacing: PositiveInt = 5
-    """Distance in cells between neighbours of one group, CosPlace's N; EigenPlaces' is 3. Places of
-    one group are that far apart."""
+    """Distance in cells between neighbouring classes of a group, CosPlace's N; EigenPlaces' is 3.
+    Places of a group are over N - 1 cells apart, or not `Places.near` each other."""
     sector_spacing: PositiveInt = 2
-    """Distance in sectors between neighbours of one group, CosPlace's L."""
+    """Distance in sectors between neighbouring classes of a group, CosPlace's L."""
     focal_distance: PositiveFloat = 10.0
     """Metres from the mean of a cell's positions to its focal point, EigenPlaces' D."""
     view_angle: PositiveFloat = 45.0

@@ -33,7 +33,7 @@ def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "")
     Args:
         config: the configuration.
         arguments: the command line's arguments.
-        preset: the size of the model, which sets the size of parts.
+        preset: preset of the model's and parts' sizes.
         path: dotted name of this configuration's own flag.
 
     Raises:
@@ -121,7 +121,7 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
     Args:
         config: the configuration to change.
         arguments: flags and values as on a command line; booleans are True or False.
-        preset: the size of the model, which sets the size of parts.
+        preset: preset of the model's and parts' sizes.
         what: beginning of messages.
 
     Returns:
@@ -288,7 +288,7 @@ def parse_settings(
         program: the command's name, for messages.
         arguments: the command line's arguments.
         defaults: the configuration that flags start from.
-        preset: the size of the model, which sets the size of parts.
+        preset: preset of the model's and parts' sizes.
 
     Returns:
         An instance of `kind`.

@@ -24,7 +24,7 @@ _PACKAGE = __name__.partition(".")[0]
 _FROM_FILE = "crisalad_plugin_"
 """Prefix of the names of modules that are loaded from plug-in files."""
 _LARGEST = 2**24
-"""Most bytes of a plug-in file: Python reads and copies all of it."""
+"""Maximum bytes of a plug-in file: Python reads and copies all of it."""
 _LOADED: dict[str, str] = {}
 """What `load_plugin` loaded, in order (for a file, its absolute path), and the module's name."""
 

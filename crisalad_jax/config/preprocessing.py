@@ -40,8 +40,7 @@ class PreprocessingConfig:
     Published models differ in it, and another filter changes a descriptor by 1e-3 to 6e-2. The
     defaults are torchvision's chain on Pillow images: `Resize`, `ToTensor`, `Normalize`.
 
-    Some authors resize a tensor before they normalise it, others after. The result is the same,
-    because resizing is linear and its weights sum to 1, so there is no field for it.
+    Normalising before or after the resize is the same: it is linear, and its weights sum to 1.
 
     Example:
         >>> chain = PreprocessingConfig(filter="bicubic", pixels="floats")
@@ -68,10 +67,10 @@ class PreprocessingConfig:
     """Whether images of a fixed size that is not a multiple of the patch size are resized again,
     to the nearest one (halves to even), bilinear and antialiased. MegaLoc does so."""
     bit_depth: BitDepth = non_semantic_field("high-byte")
-    """How colours of over 8 bits become 8-bit, before the resize. "high-byte" drops the low byte of
-    16. "contrast-stretch" spreads each image's own values, from the 1st to the 99th percentile,
+    """How deeper colours become 8-bit, before the resize. "high-byte" drops the low byte of 16
+    bits. "contrast-stretch" spreads each image's own values, from the 1st to the 99th percentile,
     over 0 to 255: for thermal images, whose values fill a small part of 16 bits, and for floats.
-    8-bit images stay as they are."""
+    8-bit images do not change."""
     normalisation: Literal["mean-deviation", "local-contrast"] = "mean-deviation"
     """How pixels are normalised: by `mean` and `deviation`, or by those of each neighbourhood."""
     mean: tuple[float, float, float] = IMAGENET_MEAN

@@ -55,9 +55,9 @@ class Registry(Generic[P]):
         A class that is not a frozen dataclass yet becomes one.
 
         Args:
-            name: what configurations, files and flags call the part.
-            presets: by the name of a preset of model sizes, the fields that differ there from the
-                part's defaults.
+            name: name of the part in configurations, files and flags.
+            presets: for each model preset, by name, the fields that differ from the part's
+                defaults.
 
         Raises:
             InputError: when decorating: the name is taken, or the part is not of this kind.
@@ -194,9 +194,9 @@ def make_part(kind: str, name: str, **settings: Any) -> Any:
     """Make a registered part by its kind and name, with settings.
 
     Args:
-        kind: such as "aggregator", "loss" or "optimiser".
-        name: what configurations and flags call the part.
-        **settings: its fields that are not at their defaults.
+        kind: kind of part, such as "aggregator", "loss" or "optimiser".
+        name: name of the part in configurations and flags.
+        **settings: fields of the part that differ from their defaults.
 
     Returns:
         The part, for the configuration's field of that kind.

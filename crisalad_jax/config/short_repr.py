@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, SupportsIndex, TypeVar
 
 _T = TypeVar("_T")
 _WIDTH = 88
-"""Most characters in a line: what a notebook shows without a scroll bar."""
+"""Maximum characters in a line: what a notebook shows without a scroll bar."""
 _FEW = 4
-"""Most items of a collection that is shown in full; of a larger one only the first is shown."""
+"""Maximum items of a collection shown in full; of a larger one only the first is shown."""
 
 
 class _Style(NamedTuple):
@@ -75,10 +75,9 @@ def _style_of(value: Any) -> _Style:
 
 
 def concise_repr(value: Any) -> str:
-    """Write a value as the call that makes it, without fields that change nothing.
+    """Write a value as the call that makes it, without fields that are unused or at defaults.
 
-    Those are fields at their defaults, and unused fields. A part at its defaults prints as its
-    name. Long calls take a line for each field.
+    A part at its defaults prints as its name. Long calls take a line for each field.
 
     Args:
         value: a dataclass, or a NamedTuple that is `brief`.

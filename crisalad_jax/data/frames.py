@@ -19,7 +19,7 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 LOG_SUFFIXES = (".mcap", ".bag", ".db3")
 """Suffixes of robot logs, in lower case."""
 FASTEST = 1000.0
-"""Most frames per second: names of video frames have milliseconds."""
+"""Maximum frames per second: names of video frames have milliseconds."""
 _TIME = re.compile(r"(.+)#t=(\d+)(?:\.(\d+))?", re.S)
 _TOPIC = re.compile(r"(.+)#([^#\s]+)", re.S)
 _OF_BAGS = b"rosbag2_bagfile_information"

@@ -155,7 +155,7 @@ def decode_image(
         keep them; `prepare_image` reduces them to 8 as the model's configuration says.
 
     Raises:
-        InputError: see `read_image`.
+        InputError: what `read_image` raises.
     """
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
     # libjpeg write warnings to stderr that OpenCV's log level does not silence.
@@ -293,7 +293,7 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
 
     The search is recursive and follows links to folders. Files are matched by `IMAGE_SUFFIXES`, in
     upper or lower case. Hidden files and folders (a name that starts with a dot) are left out; a
-    note counts the other files.
+    warning counts the other files.
 
     Raises:
         InputError: the folder is missing, is a file, or holds no image.
@@ -352,7 +352,7 @@ def is_image(path: str | os.PathLike[str]) -> bool:
 def only_images(
     files: Sequence[pathlib.Path], source: object, *, frames: bool = False
 ) -> list[pathlib.Path]:
-    """Return the images among files, and count the others by suffix in a note.
+    """Return the images among files, and count the others by suffix in a warning.
 
     Args:
         files: the files.
@@ -365,7 +365,7 @@ def only_images(
     images, others = [], []
     for file in files:
         (images if is_image(file) or (frames and has_frames(file)) else others).append(file)
-    # Sidecars of images, such as 1.json or 1.jpg.xmp of 1.jpg, and tables need no note.
+    # Sidecars of images, such as 1.json or 1.jpg.xmp of 1.jpg, and tables need no warning.
     known = {name for image in images for name in (image, image.with_suffix(""))}
     skipped = collections.Counter(
         sorted(

@@ -54,7 +54,7 @@ class FolderWatch:
 
     Existing images are left out. The folder is scanned 20 times a second, which works on any file
     system. A JPEG or PNG is complete when it decodes; a file of another format when it has not
-    changed for a second. A file that stays unreadable for five seconds is left out, with a note.
+    changed for a second. A file that stays unreadable for five seconds is left out, with a warning.
 
     Example:
         >>> import shutil
@@ -68,7 +68,7 @@ class FolderWatch:
     size: Size | None = None
     """Height and width of all frames; None if unknown."""
     dropped = 0
-    """Number of frames dropped for newer ones: none."""
+    """Number of frames dropped for newer ones: always 0."""
 
     @takes(folder=PATH)
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -165,7 +165,7 @@ class LatestFrame:
         """Create an empty queue.
 
         Args:
-            fps: most frames per second that `frames` yields; None yields as many as requested.
+            fps: maximum frames per second that `frames` yields; None yields as many as requested.
 
         Raises:
             InputError: the rate is out of range.
@@ -265,7 +265,7 @@ class Camera(LatestFrame):
 
         Args:
             camera: its number from 0, a URL, a video file, or a robot log (a ROS bag).
-            fps: most frames per second that `frames` yields; None yields as many as requested.
+            fps: maximum frames per second that `frames` yields; None yields as many as requested.
             rate: speed at which a file plays, as a multiple of its own.
             topic: topic of the images in a robot log; None takes the only one that has any.
 

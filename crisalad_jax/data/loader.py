@@ -147,7 +147,7 @@ class Reading:
     cache: ImageCache | None = None
     """Cache of decoded images."""
     quiet: bool = False
-    """Whether to show no progress bars."""
+    """Whether to hide progress bars."""
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -253,7 +253,7 @@ def training_batches(
     cache: ImageCache | None = None,
     describe: "Describe | None" = None,
 ) -> Iterator[ImageBatch]:
-    """Yield the batches of one epoch, place by place.
+    """Yield the training batches of one epoch.
 
     The same (seed, epoch, step) gives bit-identical batches for any `threads`, `start_step` and
     `part`. Images are resized to `image_size` (height, width), then augmented; large JPEGs are
@@ -267,23 +267,22 @@ def training_batches(
         images_per_place: number of images of each place.
         sampler: draws the batches; a registered sampler, or its name.
         augmentation: changes each image; a registered augmentation, or its name.
-        seed: seeds all random draws, together with the epoch and the step.
-        epoch: number of the epoch, from 0.
-        preprocessing: sets the filter that resizes bytes. Every image gets the same size, whatever
-            its size rule.
+        seed: seed of all random draws, together with the epoch and the step.
+        epoch: index of the epoch, from 0.
+        preprocessing: how images are resized; always to `image_size`, antialiased, as bytes.
         steps: number of batches; None takes what the sampler draws, which is every place once.
         start_step: the first batch to yield, to resume an interrupted epoch.
         part: (i, n) yields the i-th of n equal parts of every batch, for the i-th of n processes.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         threads: number of threads that decode ahead; 0 decodes in the caller's thread.
-        cache: stores decoded images between epochs.
-        describe: takes image files and returns their descriptors, for samplers that use them.
+        cache: cache of decoded images between epochs.
+        describe: function from image files to descriptors, for samplers that use them.
 
     Yields:
         The batches: pixels, labels, and which images are valid.
 
     Raises:
-        InputError: at once, for arguments out of range or a sampler that finds no batch; while
+        InputError: immediately, for arguments out of range or a sampler that finds no batch; while
             iterating, for an unreadable image under "stop".
 
     Example:
@@ -338,18 +337,18 @@ def batches_of_groups(
         image_size: see `training_batches`, also for the arguments below.
         augmentation: changes each image; a group shares what is drawn for its place.
         seed: numbers that seed the augmentation, together with the step.
-        preprocessing: sets the filter that resizes bytes.
+        preprocessing: see `training_batches`.
         start_step: the first batch to yield.
         part: (i, n) yields the i-th of n equal parts of every batch.
         on_bad_image: "stop" or "skip".
         threads: number of threads that decode ahead.
-        cache: stores decoded images.
+        cache: cache of decoded images.
 
     Yields:
         The batches.
 
     Raises:
-        InputError: as `training_batches`.
+        InputError: what `training_batches` raises.
     """
     _, groups, images_per_group = chosen.shape
     batch_size = groups * images_per_group

@@ -129,11 +129,11 @@ class Log:
         return chosen
 
     def position_topic(self, name: str | None = None) -> str | None:
-        """Return the name of the topic that positions are taken from; None where there is none.
+        """Return the name of the topic that positions are taken from; None if there is none.
 
         Args:
             name: the topic's name, or "none". None takes the only one of NavSatFix or, without any
-                of that type, the only one of odometry or poses; a note lists them if several.
+                of that type, the only one of odometry or poses; a warning lists them if several.
 
         Raises:
             InputError: the log has no such topic, or it has no positions.
@@ -181,7 +181,7 @@ class Log:
             yield stamp, decode_message(message, str(FrameName(str(self.path), name, stamp)))
 
     def stamps(self, topic: str) -> Int64[np.ndarray, " n"]:
-        """Return the stamps of a topic's images, sorted, each once; notes report any that were not.
+        """Return the stamps of a topic's images, sorted, each once; warn if some were not.
 
         Raises:
             InputError: the log cannot be read.

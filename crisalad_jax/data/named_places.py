@@ -56,7 +56,7 @@ class FoundPlace(NamedTuple):
 
     name: str
     images: Mapping[str, View | None]
-    """Path relative to the root -> the view; None where positions are unknown."""
+    """Views by path relative to the root; None if positions are unknown."""
     near: Sequence[int] = ()
     """Indices of places that are too close to share a batch with it."""
     city: int = 0
@@ -101,7 +101,7 @@ def _read_city(
         return ("", {}) if there is None else (there.name, disk.names(there))
 
     def find(folders: Sequence[str], stem: str) -> str | None:
-        """Return the path of an image relative to the root; None where there is none."""
+        """Return the path of an image relative to the root; None if there is none."""
         for folder in folders:
             there, files = listing(folder)
             for name in (f"{stem}.jpg", f"{stem}.JPG"):
@@ -209,7 +209,7 @@ def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
 def _read_table(
     path: pathlib.Path, on_bad_image: OnBadImage
 ) -> tuple[tuple[str, ...], list[FoundPlace]]:
-    """Read the cities and places of a table; under "skip" a note counts the missing images."""
+    """Read the cities and places of a table; under "skip" a warning counts missing images."""
     table = read_table(path, "name", any_spelling=True)
     given = [column for column in _VIEW if column in table.columns]
     # A heading is only useful with a position.
@@ -252,7 +252,7 @@ def places_by_position(
 
     Args:
         source: the images.
-        radius: in metres.
+        radius: radius of a place in metres.
         positions: a table (`read_image_table`) or track (`read_track`); None takes those of the
             source if it is a table, else those in @UTM names, else the EXIF data of JPEGs.
 

@@ -46,16 +46,16 @@ class Places:
     root: pathlib.Path
     cities: tuple[str, ...]
     files: tuple[str, ...]
-    """Image -> path relative to `root`, as text: a Path takes ten times the memory."""
+    """Paths of the images relative to `root`, as text: a Path takes ten times the memory."""
     place_start: Int64[np.ndarray, " places+1"]
     place_city: Int32[np.ndarray, " places"]
-    """Place -> position in `cities`, ascending."""
+    """Index in `cities` of each place, ascending."""
     names: tuple[str, ...]
-    """Place -> its name."""
+    """Name of each place."""
     views: Float64[np.ndarray, "images 3"] | None = None
-    """Image -> latitude, longitude and heading, NaN where it has no heading."""
+    """Latitude, longitude and heading of each image; NaN for an unknown heading."""
     near: tuple[Int64[np.ndarray, " _"], ...] | None = None
-    """Place -> other places that are too close to share a batch with it; None if any two may."""
+    """For each place, those too close to share a batch with it; None if any two may."""
 
     @property
     def image_counts(self) -> Int64[np.ndarray, " places"]:
@@ -64,7 +64,7 @@ class Places:
 
     @functools.cached_property
     def image_place(self) -> Int32[np.ndarray, " images"]:
-        """Image -> place, ascending."""
+        """Place of each image, ascending."""
         return np.repeat(np.arange(len(self.names), dtype=np.int32), self.image_counts)
 
     def path(self, image: int | np.integer) -> pathlib.Path:
@@ -109,8 +109,8 @@ def read_places(
 ) -> Places:
     """Read training places from a folder in the layout of GSV-Cities or MSLS, or in a custom one.
 
-    Or make places from any source of images, by their positions or their order. Then places that
-    are too close to tell apart (`Places.near`) never share a batch.
+    Or group the images of any source into places, by position or order. Places that are too close
+    to tell apart (`Places.near`) then never share a batch.
 
     A custom layout is a folder in which each folder with images is a place; or a table with the
     columns `name,place` and, if known, `lat,lon`, `heading` (all in degrees) and `city`: a file, or
@@ -121,8 +121,7 @@ def read_places(
     database and of the queries, without panoramas.
 
     GSV-Cities' images may end in .jpg or .JPG, and may be in a folder named after the city id or
-    the CSV file. A row that repeats an earlier one of its place is dropped, so that no image is its
-    own second view.
+    the CSV file. A row that repeats an earlier one of its place is dropped.
 
     Args:
         root: folder that holds `Dataframes/` and `Images/`, or a custom layout, local or at an
@@ -130,7 +129,7 @@ def read_places(
             source of images (`open_source`).
         cities: names of CSV files without the suffix, or of MSLS's folders; None reads all, or for
             MSLS those of its training set.
-        min_images: places with fewer images are left out, and a note counts them.
+        min_images: minimum number of images; a warning counts places with fewer.
         place_radius: radius of a place in metres. In the order of the images, one that is farther
             than this from all centres becomes a centre; then each image joins the place with the
             nearest centre. Centres in a batch are more than four radii apart.
@@ -139,7 +138,7 @@ def read_places(
         positions: table or track of positions for `place_radius` (`read_image_table`,
             `read_track`). None takes those of the source if it is a table or a robot log, else
             those in @UTM names, else the EXIF data of JPEGs.
-        fps: frames per second to take from videos and logs; None takes one.
+        fps: frames per second to take from videos and logs; None is 1.
         topic: the topic of images in a robot log; None takes the only one.
         on_bad_image: "stop" if an image that a table names is missing, or "skip" it.
 
@@ -149,7 +148,7 @@ def read_places(
     Raises:
         InputError: none of these layouts, an unknown or repeated city, a CSV without a column or
             with a field that is not a number, a missing image, no place large enough, no position,
-            or arguments that do not go together.
+            or conflicting arguments.
 
     Example:
         >>> read_places(places, min_images=3).image_counts.tolist()

@@ -224,7 +224,7 @@ def _along(
     paths: Sequence[pathlib.Path],
     images: str | os.PathLike[str],
 ) -> Positions:
-    """Interpolate the positions of images along a track; a note counts the images that have one.
+    """Interpolate the positions of images along a track; a warning counts those with one.
 
     Raises:
         InputError: none was taken between the track's ends; or what `_times` raises.
@@ -310,8 +310,8 @@ def read_image_table(
         The images' names in the table's order, and their positions; None without such columns.
 
     Raises:
-        InputError: as `read_table`, `Table.axes` and `Table.named_rows`; or a value that is not a
-            finite number, latitude or longitude.
+        InputError: what `read_table`, `Table.axes` and `Table.named_rows` raise; or a value that is
+            not a finite number, latitude or longitude.
     """
     table = read_table(pathlib.Path(path), "name", any_spelling=True)
     axes = table.axes("name", must=all_positions)

@@ -1,4 +1,4 @@
-"""Prepare a decoded photograph for a network: 8-bit RGB, resized, and normalised if floats."""
+"""Prepare a decoded photograph for a network: 8-bit RGB, resized, and normalised if float."""
 
 import dataclasses
 import threading
@@ -25,7 +25,7 @@ extremes, a dead pixel of a thermal camera would use up the range."""
 _NARROW = 2**14
 """Range of 16-bit values below which an image has fewer than 64 of 256 grey levels."""
 _noted = threading.Lock()
-"""Acquired for good by the first note: a set of thermal images would give thousands."""
+"""Acquired for good by the first warning: a set of thermal images would give thousands."""
 
 
 def as_rgb(
@@ -108,7 +108,7 @@ class Preparation:
     check_size: Callable[[Size], None] | None = dataclasses.field(
         default=None, compare=False, repr=False
     )
-    """Raises InputError for a height and width that the model cannot describe."""
+    """Function that raises InputError for a height and width that the model cannot describe."""
     local_features: LocalFeatures | None = None
     """Local features that replace the pixels, if any."""
     encoded_size: Size | None = None
@@ -146,7 +146,7 @@ class Preparation:
         return self.preprocessing.rounded_size(first, self.side_multiple)
 
     def prepare(self, image: np.ndarray, name: str = "image") -> Pixels:
-        """Resize an image, and normalise floats.
+        """Resize an image, and normalise it if it is float.
 
         Args:
             image: RGB or grey, as `as_rgb` takes it.

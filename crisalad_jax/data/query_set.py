@@ -25,15 +25,15 @@ class QuerySet:
 
     root: pathlib.Path
     files: tuple[str, ...]
-    """Image -> path, as text: the database, then all queries."""
+    """Paths of the images, as text: the database, then all queries."""
     database: int
     """Number of database images, the first of `files`."""
     queries: Int64[np.ndarray, " query"]
-    """Image of each query that has positives."""
+    """Index in `files` of each query that has positives."""
     positives: tuple[Int64[np.ndarray, " _"], ...]
-    """Query -> database images that show its place, at least one, ascending."""
+    """For each query, the database images of its place, at least one, ascending."""
     near: tuple[Int64[np.ndarray, " _"], ...]
-    """Query -> database images that are not negatives, ascending; includes its positives."""
+    """For each query, the images that are not negatives, ascending, positives included."""
 
     def path(self, image: int | np.integer) -> pathlib.Path:
         """Return the path of one image."""
@@ -53,8 +53,8 @@ def read_query_set(
 
     Args:
         root: a folder or file; from a folder with several splits, `train` is read.
-        positive_radius: in metres, inclusive.
-        negative_radius: in metres; database images within it are not negatives.
+        positive_radius: radius of positives in metres, inclusive.
+        negative_radius: metres within which database images are not negatives.
         images: the folder of the images that a file names.
         on_bad_image: see `open_benchmark`.
 

@@ -31,19 +31,19 @@ def image_batches(
         image_size: height and width in pixels that images are resized to, or from which the size
             rule of `preprocessing` computes the size.
         batch_size: number of images in a batch.
-        preprocessing: how images are resized, and floats normalised.
+        preprocessing: how images are resized and, if float, normalised.
         side_multiple: sides are rounded to multiples of this number of pixels.
-        check_size: raises InputError for a height and width that no image may have.
+        check_size: function that raises InputError for a height and width to refuse.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         threads: number of threads that decode ahead; 0 decodes in the caller's thread.
-        cache: stores decoded images.
+        cache: cache of decoded images.
 
     Yields:
         The batches: pixels, indices into `paths`, and which images are valid.
 
     Raises:
-        InputError: at once, for arguments out of range; while iterating, for an unreadable image
-            under "stop".
+        InputError: immediately, for arguments out of range; while iterating, for an unreadable
+            image under "stop".
 
     Example:
         >>> paths = sorted(pictures.iterdir())

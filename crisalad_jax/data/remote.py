@@ -132,14 +132,14 @@ def size_of(path: pathlib.Path) -> int | None:
 
 
 def is_file(path: pathlib.Path) -> bool:
-    """Return whether a local or remote file exists; raises as `size_of`."""
+    """Return whether a local or remote file exists; raises like `size_of`."""
     if not is_remote(path):
         return path.is_file()
     return bool(_if_there(path, lambda files, there: files.info(there)["type"] == "file"))
 
 
 def is_folder(path: pathlib.Path) -> bool:
-    """Return whether a folder exists (if remote, with something in it); raises as `size_of`."""
+    """Return whether a folder exists (if remote, with something in it); raises like `size_of`."""
     return bool(list_names(path)) if is_remote(path) else path.is_dir()
 
 

@@ -140,7 +140,7 @@ def open_source(
             a pattern, where ** matches any folders; a list (.txt) with one path per line; or a
             table (.csv) with a column `name` (see `read_image_table`). Paths in lists and tables
             are relative to their folder.
-        fps: frames per second to take from videos and logs; None takes one, and a note says so.
+        fps: frames per second to take from videos and logs; None is 1, with a warning.
         topic: the topic of images in logs; None takes the only one.
         position_topic: the topic of positions in logs; None takes the only one of NavSatFix, else
             the only one of odometry or poses; "none" takes none.

@@ -49,11 +49,11 @@ class Track(NamedTuple):
         """Interpolate positions linearly in time between the track's points.
 
         Args:
-            times: in seconds since 1970.
+            times: times in seconds since 1970.
 
         Returns:
             The positions, NaN before the first point and after the last one; and for each the
-            seconds between the two track points around it, 0 where it is at a point.
+            seconds between the two track points around it, 0 at a point.
 
         Example:
             >>> import numpy as np
@@ -102,8 +102,8 @@ def read_track(
             `coordTimes` or `times`, or points with `time`. A table has the columns time and
             lat,lon or east,north or x,y, or other usual names of these.
         start_time: when a video of the images began, with the zone: "2026-05-01T12:00:00+02:00".
-        time_offset: seconds that are added to the times of images, for cameras whose clock is
-            wrong or shows local time: -7200 where it is two hours ahead of UTC.
+        time_offset: seconds that are added to the times of images, for cameras whose clock is wrong
+            or shows local time: -7200 if it is two hours ahead of UTC.
 
     Returns:
         The track, which `index` takes as `positions`.

@@ -46,8 +46,8 @@ def calibrate(
         benchmark: the set, for instance from `open_benchmark`.
         precision: share of the answers that must be correct, above 0 and at most 1.
         model: the model that made the map; None loads it from its recorded path (`Map.load_model`).
-        verify: measures how many inliers verified answers must have, which the map stores
-            separately; None measures the similarity.
+        verify: how to verify answers, to measure the number of inliers that they need (stored
+            separately); None measures the similarity.
         reading: how images are read.
 
     Returns:

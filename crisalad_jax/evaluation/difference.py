@@ -36,12 +36,12 @@ def paired_difference(
 
     A resample draws as many queries and seeds as there are, with replacement, the same queries for
     both methods. Runs of one seed share initial values and batches, so the same seeds are drawn for
-    both, and what a seed does to both cancels. Queries with the same hits are drawn together from a
+    both, and their common effect cancels. Queries with the same hits are drawn together from a
     multinomial distribution, which is exact and takes no longer with more queries.
 
     Args:
         hits: whether each query was a hit, for each seed of the method.
-        reference: the same for the reference, on the same queries.
+        reference: hits of the reference, on the same queries.
         same_seeds: whether row i of both is a run of the same seed. If not, as for a model from a
             file, the seeds of each method are drawn independently.
         resamples: number of resamples.

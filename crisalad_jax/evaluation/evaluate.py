@@ -68,13 +68,13 @@ def evaluate(
     seed at a time.
 
     Args:
-        model: parameters and configuration, as `load` returns them, or a `Runtime`.
-        benchmark: what to evaluate on.
+        model: a model from `load`, or a `Runtime`.
+        benchmark: the evaluation set.
         groupings: each as `Grouping.parse` reads it, or `published:NAME` with cricavpr, crisalad or
-            sage: the batches of that paper's evaluation, then the honest ones of the same size.
+            sage: the batches of that paper, then single, shuffled and masked ones of its size.
         seed: seed of the first shuffle of the database; the queries use the next seed.
         seeds: number of shuffles, whose seeds are two apart.
-        pca: shortens the descriptors; fitted to images of other places.
+        pca: components that shorten the descriptors, fitted to other places.
         dtype: how descriptors are compared; "bits" compares their signs (`pack_bits`) by the
             Hamming distance.
         observe: called with the descriptors of each grouping's first seed; for bits, with unit

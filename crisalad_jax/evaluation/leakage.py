@@ -66,7 +66,7 @@ def masked(batches: Batches, same: SamePlace) -> Batches:
     another image of its place through a third one.
 
     Args:
-        batches: batches in which every filled slot is kept.
+        batches: batches without discarded slots.
         same: whether two images show the same place.
     """
     batch, place = np.nonzero(batches.kept)

@@ -21,7 +21,7 @@ def right_retrievals(
 
     Args:
         indices: database indices of each query's neighbours, best first.
-        positives: the database indices that are correct for each query, possibly none.
+        positives: correct database indices of each query, possibly none.
 
     Raises:
         InputError: no queries; positives for a different number of queries; a negative index, which
@@ -49,11 +49,11 @@ def recalls(
 
     Args:
         indices: database indices of each query's neighbours, best first.
-        positives: the database indices that are correct for each query, possibly none.
+        positives: correct database indices of each query, possibly none.
         ks: the values of K.
 
     Returns:
-        K -> fraction of the queries, 0 to 1.
+        The fraction of the queries, 0 to 1, by K.
 
     Raises:
         InputError: a K below 1, or what `right_retrievals` raises.
@@ -85,7 +85,7 @@ def bootstrap_interval(hits: Int[np.ndarray, " q"], trials: int = 1) -> Interval
 
     Args:
         hits: number of trials in which each query was a hit.
-        trials: for instance the seeds of a shuffle; the interval does not include their spread.
+        trials: number of trials, such as seeds; the interval does not include their spread.
 
     Raises:
         InputError: no queries, or a hit below 0 or above `trials`.
@@ -130,7 +130,7 @@ def accepted(
     """Accept queries by the similarity of their first retrieval, strictest threshold first.
 
     Args:
-        similarities: those of the first retrievals.
+        similarities: similarities of the first retrievals.
         right: which first retrievals are correct.
 
     Returns:
@@ -161,8 +161,8 @@ def precision_recall(
 
     Args:
         indices: database indices of each query's neighbours, best first; only the first counts.
-        similarities: those of `indices`.
-        positives: the database indices that are correct for each query, possibly none.
+        similarities: similarities of `indices`.
+        positives: correct database indices of each query, possibly none.
 
     Returns:
         The curve, or None if no query has a positive, since recall is then undefined.

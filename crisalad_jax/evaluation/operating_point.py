@@ -16,7 +16,7 @@ CONFIDENCE = 0.95
 
 
 class OperatingPoint(NamedTuple):
-    """Outcome of accepting first retrievals from some similarity, measured on some queries.
+    """Outcome of accepting first retrievals from some similarity on.
 
     If no similarity reaches the requested precision, this is the point of highest precision, and
     `reached` is False.
@@ -89,8 +89,8 @@ def operating_point(
 
     Args:
         indices: database indices of each query's neighbours, best first; only the first counts.
-        similarities: those of `indices`.
-        positives: the database indices that are correct for each query, possibly none.
+        similarities: similarities of `indices`.
+        positives: correct database indices of each query, possibly none.
         precision: share of accepted first retrievals that must be correct, above 0 and at most 1.
 
     Returns:
@@ -153,7 +153,7 @@ def check_supported(point: OperatingPoint, source: str) -> None:
     """Check that a similarity does not rest on a coincidence; `caveats` says what it shows.
 
     Args:
-        point: what was measured.
+        point: the operating point.
         source: name of the set, for the message.
 
     Raises:

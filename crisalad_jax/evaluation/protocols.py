@@ -74,8 +74,8 @@ def check_groupings(texts: Sequence[str]) -> list[str]:
 def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
     """Make the groupings of an evaluation, in order and without repeats.
 
-    A published grouping is followed by the honest ones of the same batch size: single images,
-    random order, and no other images of the same place.
+    A published grouping is followed by single images and, in batches of the same size, random order
+    and no other images of the same place.
 
     Args:
         texts: each as `Grouping.parse` reads it, or `published:NAME` with a name in `PROTOCOLS`.

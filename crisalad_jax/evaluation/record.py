@@ -93,7 +93,7 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
 
     Args:
         results: what `evaluate` returned.
-        settings: those of a `Record`.
+        settings: settings of a `Record`.
 
     Returns:
         The paragraphs.

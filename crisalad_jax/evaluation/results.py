@@ -116,11 +116,11 @@ def summarise(
 
     Args:
         grouping: its name.
-        rankings: seed -> neighbours; one ranking if nothing is random.
-        positives: the database indices that are correct for each query.
+        rankings: neighbours by seed; one ranking if nothing is random.
+        positives: correct database indices of each query.
         ks: the values of K.
         is_random: whether the rankings differ between seeds.
-        precision: of the operating point; None for no operating point.
+        precision: precision of the operating point; None for no operating point.
         **known: other fields of `GroupingResult`, such as its shares.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Fit a model to the place of a map: a few steps on the map's own images."""
+"""Adapt a model to the environment of a map: a few steps on the map's own images."""
 
 import dataclasses
 import os
@@ -46,7 +46,7 @@ Path = str | os.PathLike[str]
 
 @brief
 class Adapted(NamedTuple):
-    """What an adaptation gained, and what it cost elsewhere."""
+    """The gain of an adaptation, and its loss on other places."""
 
     steps: int
     held_out: tuple[float, float]
@@ -79,7 +79,7 @@ def adapt(
     callbacks: Sequence[Callback | str] = (),
     say: Callable[[str], None] = lambda line: None,
 ) -> Adapted:
-    """Fit the model of a map to its place, or resume the run in `out`.
+    """Adapt a map's model to the map's environment, or resume the run in `out`.
 
     A place is the images within `place_radius`; in a map without positions, it is `place_frames`
     consecutive images, or by default a single one under two augmentations. A fifth of the images is
@@ -87,7 +87,7 @@ def adapt(
     train, and two others whether anything was gained.
 
     Args:
-        config: how to train, usually `recipe(name="adapt", model=...)` with the map's model.
+        config: the training configuration: `recipe(name="adapt", model=...)` for the map's model.
         folder: the map, whose images must be where they were indexed.
         out: folder for the run, the held-out pictures and `adapted.safetensors`.
         weights: the map's weights, if they were moved; None for the path that the map records.
@@ -95,7 +95,7 @@ def adapt(
             map.
         place_radius: metres from a place's centre within which its images lie, for a map with
             positions; None for 10.
-        place_frames: number of consecutive images that are a place, for a map without positions.
+        place_frames: number of consecutive images of a place, for a map without positions.
         watch: evaluation sets of other places, whose recall is compared before and after.
         most_lost: largest accepted drop in Recall@1 of a watched set, as a fraction; the map is
             not replaced if any drops more.
@@ -107,13 +107,13 @@ def adapt(
         say: called with each line to print.
 
     Returns:
-        What was gained, which is also written to `adapted.json` in `out`.
+        The gain, which is also written to `adapted.json` in `out`.
 
     Raises:
-        InputError: a model other than the map's; missing images; `place_frames` for a map
-            with positions, or `place_radius` for one without; too few images; `out` within the map;
-            `replace` for a map that cannot be rebuilt; a map that was rebuilt with `out`'s weights;
-            what `open_sources`, `open_benchmark` and `fit` raise.
+        InputError: a model other than the map's; missing images; `place_frames` for a map with
+            positions, or `place_radius` for one without positions; too few images; `out` within the
+            map; `replace` for a map that cannot be rebuilt; a map that was rebuilt with `out`'s
+            weights; what `open_sources`, `open_benchmark` and `fit` raise.
         Interrupted: the same call resumes.
 
     Example:

@@ -37,7 +37,7 @@ class Split(NamedTuple):
     training: Places
     """Places made of the images that are not held out."""
     answers: dict[int, list[int]]
-    """Held-out image -> its correct answers among the others; itself if it has none."""
+    """Correct answers to each held-out image among the others; itself if there are none."""
     database: list[int]
     """Images of the map that held-out ones query."""
     rule: str

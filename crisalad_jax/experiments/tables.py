@@ -132,7 +132,7 @@ class RecallRow(NamedTuple):
     grouping: str
     """How images were batched: single, shuffled or sequential."""
     recalls: Mapping[int, float]
-    """K -> fraction of the queries, 0 to 1."""
+    """Fraction of the queries, 0 to 1, by K."""
 
 
 def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:

@@ -53,13 +53,13 @@ def train(
     """Train on a folder of places, or resume the run in `out`, and draw its curves.
 
     Args:
-        config: how to train.
+        config: the training configuration.
         data: places, in a layout that `read_places` reads, local or remote; or the sets of
             `config.mixture` by name, in such layouts; or, for a recipe that mines tuples, a set
             that `open_benchmark` reads, such as pitts30k_train.mat.
-        place_radius: metres within which images of a source with positions are a place; see
-            `read_places`, also for the next four.
-        place_frames: number of consecutive images that are a place.
+        place_radius: radius of a place in metres; see `read_places`, also for the next four
+            arguments.
+        place_frames: number of consecutive images of a place.
         positions: table of positions.
         fps: frames per second taken from videos and logs.
         topic: the topic of images in a log.
@@ -67,15 +67,15 @@ def train(
         out: folder of the run; see `fit`.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
         validation_images: folder of the images that a .mat file or .npy lists in `validation` name.
-        weights: a complete model to start from, or a published model's name. `config.model` is
-            what is trained and saved; `recipe(model=load(weights).config)` has the file's.
+        weights: a complete model to start from, or a published model's name. It must fit
+            `config.model`; `recipe(model=load(weights).config)` makes a `config` that does.
         backbone: a checkpoint to start the backbone from, or a published model's name.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
         num_threads: number of threads that read the training images; None for one per usable core.
-        shard_state: shard the trainable parameters and their moments, one shard per device.
+        shard_state: whether to shard trainable parameters and their moments over the devices.
         cache_gb: maximum gigabytes of remote images cached on this host's disk.
         callbacks: see `fit`.
-        quiet: no progress bars.
+        quiet: whether to hide progress bars.
         say: called with each line to print.
 
     Returns:

@@ -22,14 +22,14 @@ from jaxtyping import Array, Float
 _LANES = 128
 """Values in a row of a vector register: heads are read that many values at a time."""
 _WIDTH = 512
-"""Most values of each token, over all heads, that a kernel step reads: fewer steps wait less."""
+"""Maximum values of each token, over all heads, that a kernel step reads: fewer steps wait less."""
 _PIECES = 12
-"""Most score products that a step is unrolled into: more take minutes to compile. A step has at
+"""Maximum score products that a step is unrolled into: more take minutes to compile. A step has at
 least one unit of lanes."""
 _ROWS = 384
-"""Most queries whose scores are computed at a time."""
+"""Maximum queries whose scores are computed at a time."""
 _TOKENS = {jnp.dtype(jnp.bfloat16): 2048, jnp.dtype(jnp.float32): 640}
-"""Most tokens by type: their scores for `_ROWS` queries are 3 MiB. In float32, more tokens take
+"""Maximum tokens by type: their scores for `_ROWS` queries are 3 MiB. In float32, more tokens take
 minutes to compile."""
 _MEMORY = 2**26
 """Bytes of a chip's vector memory that a kernel may use: half of the smallest chip's since v5e."""

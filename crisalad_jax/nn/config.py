@@ -207,8 +207,8 @@ class ModelConfig:
             The configuration, for the same parameters.
 
         Raises:
-            InputError: as `check_image_size` and `PreprocessingConfig.changed_by`; or a size is
-                given for a model that takes images at their own size.
+            InputError: what `check_image_size` and `PreprocessingConfig.changed_by` raise; or a
+                size is given for a model that takes images at their own size.
 
         Example:
             >>> PRESETS["tiny"].resized((70, 98)).grid
@@ -268,7 +268,7 @@ def with_aggregator(model: ModelConfig, name: str, preset: str, **changes: Any) 
     Args:
         model: the model.
         name: a registered aggregator.
-        preset: name in `PRESETS` of the size that the aggregator takes.
+        preset: preset of the aggregator's size.
         **changes: other fields of the model.
 
     Returns:

@@ -49,7 +49,7 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     Work that is done once per batch, independent of its images, is not counted.
 
     Args:
-        config: the model; images are of its `input_size`.
+        config: the model's configuration; images are of its `input_size`.
         images: number of images that attend to each other in the cross-image encoder. Only the
             cost of its attention depends on it.
 
@@ -164,7 +164,7 @@ def paper_adapter_macs(config: ModelConfig, macs: int) -> int:
     Its linear layers, `down` and `up`, count once each; the paper's other layers are convolutions.
 
     Args:
-        config: the model.
+        config: the model's configuration.
         macs: from `adapter_macs`, which counts a linear layer at every token instead.
     """
     backbone: Any = config.backbone

@@ -74,11 +74,11 @@ class Model(NamedTuple):
 
 @takes(config=ModelConfig, key=jax.Array)
 def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
-    """Draw random parameters in float32.
+    """Initialise a model's parameters at random, in float32.
 
     Args:
         key: random key.
-        config: the model.
+        config: the model's configuration.
 
     Returns:
         The parameters. To use DINOv2's weights, replace `backbone` with them.
@@ -123,7 +123,7 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
 
     Args:
         params: the parameters.
-        config: the model.
+        config: the model's configuration.
         stored: whether they are to be saved, which needs unsplit, finite float32 arrays.
 
     Raises:
@@ -170,7 +170,7 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
 
     Args:
         params: the parameters, or a tree of these with some left out.
-        config: the model.
+        config: the model's configuration.
 
     Returns:
         Parameters that `describe` accepts as well. In float32 they are `params` itself.
@@ -267,11 +267,11 @@ def describe(
     attention is fused, the gradient can be taken only once.
 
     Args:
-        params: from `init_crisalad` or a weight file.
+        params: parameters from `init_crisalad` or a weight file.
         images: 8-bit pixels, which are normalised here as `config.preprocessing` says, or floats
             that already are (float pixels from 0 to 1 or 0 to 255 are rejected). The sides may be
             any that the backbone accepts, not only `config.image_size`. See `prepare_image`.
-        config: the model, static.
+        config: the model's configuration; static.
         mask: which images attend to which.
         key: a `jax.random.key` for dropout; None means inference.
         micro_batch: see `extract_tokens`; images still attend to the whole batch.
@@ -324,7 +324,7 @@ def extract_tokens(
         The tokens of each image.
 
     Raises:
-        InputError: as `describe`.
+        InputError: what `describe` raises.
 
     Example:
         >>> import jax, numpy as np
@@ -366,7 +366,7 @@ def tokens_and_statistics(
         statistics after this batch, and None for all other leaves; it is None if `valid` is.
 
     Raises:
-        InputError: as `describe`.
+        InputError: what `describe` raises.
     """
     count = images.shape[0]  # may be symbolic, unlike `len`
     keys = None if key is None else jax.random.split(key, count)
@@ -452,7 +452,7 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
         The requested features.
 
     Raises:
-        InputError: as `describe`.
+        InputError: what `describe` raises.
 
     Example:
         >>> import jax, numpy as np
@@ -523,7 +523,7 @@ def unit_features(
     They are in float32 at least. Tokens that the aggregator inserts are left out of the backbone.
 
     Raises:
-        InputError: as `describe`.
+        InputError: what `describe` raises.
     """
     features, _ = _extract_features(params, images, config, with_insertion=False)
     return l2_normalise(at_least_float32(features.patches))
@@ -545,7 +545,7 @@ def attend_across_images(
 
     Args:
         params: see `describe`.
-        tokens: from `extract_tokens`.
+        tokens: tokens from `extract_tokens`.
         config: see `describe`.
         mask: see `describe`.
         key: see `describe`.
@@ -648,8 +648,8 @@ def attention_maps(
         The softmax of the scores, in float32 at least.
 
     Raises:
-        InputError: the backbone has no such block, no attention, or adapters on a side path; or as
-            `describe`.
+        InputError: the backbone has no such block, no attention, or adapters on a side path; or
+            what `describe` raises.
 
     Example:
         >>> import jax, numpy as np
@@ -689,8 +689,8 @@ def cross_image_attention(
     """Compute the attention between images in the layers of the cross-image encoder.
 
     Entry (i, j) is the weight of image j's token for the same token of image i; rows sum to 1. The
-    tokens are the pieces of the global token that the encoder cuts it into, then the clusters; or
-    the pieces of the descriptor, if the encoder cuts that.
+    tokens are the pieces of the global token, then the clusters; or the pieces of the descriptor,
+    if the encoder cuts that.
 
     Args:
         params: see `describe`.
@@ -702,7 +702,7 @@ def cross_image_attention(
         The softmax of the scores, in float32 at least.
 
     Raises:
-        InputError: the model has no cross-image encoder with attention, or as `describe`.
+        InputError: the model has no cross-image encoder with attention, or what `describe` raises.
 
     Example:
         >>> import jax, numpy as np
@@ -739,7 +739,7 @@ def describe_training_batch(
         measured: images that batch norms take their statistics from; None uses the stored ones.
         key: random key for dropout; None means no dropout.
         micro_batch: see `extract_tokens`.
-        sub_batches: sizes of consecutive groups whose images attend to each other; none are one.
+        sub_batches: sizes of consecutive groups whose images attend to each other; by default one.
 
     Returns:
         (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them. The
@@ -777,7 +777,7 @@ def transport_masses(
         The plan of each image.
 
     Raises:
-        InputError: the model's aggregator has no transport, or as `describe`.
+        InputError: the model's aggregator has no transport, or what `describe` raises.
 
     Example:
         >>> import jax, numpy as np
@@ -828,7 +828,7 @@ def params_of(arrays: Mapping[str, np.ndarray], config: ModelConfig, *, source: 
 
     Args:
         arrays: unsplit, finite float32 arrays.
-        config: the model.
+        config: the model's configuration.
         source: the file, for messages.
 
     Raises:

@@ -23,7 +23,7 @@ give more."""
 _OVERSHOOT = 1.5
 """Range of a bicubic filter's output on float pixels with a range of 1."""
 _SPREAD = 0.5
-"""Least range of pixels from 0 to 1. Normalised images within 0 to 1 are nearly uniform."""
+"""Minimum range of pixels from 0 to 1. Normalised images within 0 to 1 are nearly uniform."""
 
 
 def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) -> None:

@@ -39,7 +39,7 @@ def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8
     is the rule of SelaVPR++; TeTRA maps 0 to 0, and all other values the same way.
 
     Args:
-        descriptors: of the n images, of any norm; d is a multiple of 8.
+        descriptors: descriptors of the n images, of any norm; d is a multiple of 8.
 
     Returns:
         The packed bits, as `search` takes them.

@@ -44,11 +44,11 @@ class Described(NamedTuple):
 
 
 def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image") -> Pixels:
-    """Resize an image according to the configuration of a model, and normalise floats.
+    """Resize an image as a model's configuration says, and normalise it if it is float.
 
     Args:
         image: 8-bit RGB, from `read_image`; or grey (height, width) or (height, width, 1), which is
-            repeated over the channels; or uint16, which the configuration converts to 8 bits.
+            repeated over the channels; or a type that `PreprocessingConfig.bit_depth` converts.
         config: the model's configuration.
         name: name of the image, for messages.
 
@@ -98,7 +98,7 @@ def describe_files(
     depends on nothing else. `extract` does the same for folders, and writes files.
 
     Args:
-        model: parameters and configuration, as `load` returns them, or a `Runtime`.
+        model: a model from `load`, or a `Runtime`.
         files: an image file, or a list of them.
         reading: how the files are read.
 
@@ -133,7 +133,7 @@ def describe_images(
     one. Values differ from those of `describe_files` by rounding, as batch sizes differ.
 
     Args:
-        model: parameters and configuration, as `load` returns them, or a `Runtime`.
+        model: a model from `load`, or a `Runtime`.
         images: 8-bit RGB, of any sizes, as `read_image` returns them, or grey; see
             `prepare_image`.
         batch_size: maximum number of images described together.
@@ -277,7 +277,7 @@ def readable(
     Args:
         stream: descriptors.
         size: number of descriptors to join.
-        items: of all images, such as their names.
+        items: items of all images, such as their names.
         unreadable: the items of the other images are appended to it.
     """
     for part in joined(stream, size):

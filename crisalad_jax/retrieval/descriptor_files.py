@@ -85,7 +85,7 @@ def write_descriptors(
     Args:
         path: a .npy or .h5 file.
         descriptors: a row for each image.
-        names: of the images.
+        names: names of the images.
         record: how they were made, as JSON values.
         within: a folder for temporary files, see `files.atomic_path`.
         written: a .npy file of the descriptors on the same disk, to be moved instead of copied.
@@ -206,8 +206,8 @@ def read_descriptors(
 ) -> tuple[list[str], Descriptors]:
     """Read names and descriptors of any float type, from `write_descriptors` or hloc.
 
-    A .npy file is memory-mapped: its rows are read when they are used. A note reports a set without
-    a record of its digests.
+    A .npy file is memory-mapped: its rows are read when they are used. A warning reports a set
+    without a record of its digests.
 
     Args:
         path: the file.

@@ -92,15 +92,15 @@ def extract(
     """Describe images, and write the descriptors to `out` if it is given.
 
     With `out`, repeating a killed call resumes it, and only one process at a time may write there.
-    Tokens and descriptors are stored in files meanwhile; memory holds a few hundred images' worth.
+    While it runs, tokens and descriptors are in files; memory holds a few hundred images' worth.
 
     Args:
-        model: parameters and configuration, as `load` returns them, or a `Runtime`.
+        model: a model from `load`, or a `Runtime`.
         images: a folder, searched with its subfolders in sorted order, another source of images
             (docs/how-to/image-sources.md), or a list of files.
         out: a .npy file, with the names in a second file, or an .h5 file as hloc reads it. A JSON
             file next to it records how it was made. None writes nothing.
-        fps: frames per second taken from a video or log, which is then required; None is one.
+        fps: frames per second, if `images` is a video or log; None is 1.
         topic: the image topic of a robot log; None uses the only one.
         positions: where images were taken, for `every_metres`, as in `index`.
         every_metres: minimum distance of an image from the last selected one of its folder or

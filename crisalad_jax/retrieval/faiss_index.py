@@ -75,7 +75,7 @@ class Index(NamedTuple):
 
         Args:
             queries: unit descriptors.
-            k: neighbours per query; at most all.
+            k: number of neighbours per query.
             effort: how much to search; more finds more and takes longer. For HNSW, the number of
                 candidates (the larger of 128 and 2 k by default); for IVF-RaBitQ, the number of
                 lists (the larger of 256 and a sixteenth of them by default).
@@ -113,7 +113,7 @@ class Index(NamedTuple):
         Args:
             parts: unit descriptors.
             count: total number of rows, for the progress bar.
-            quiet: no progress bar.
+            quiet: whether to hide the progress bar.
 
         Raises:
             InputError: rows that are not finite or not of unit length.
@@ -150,8 +150,8 @@ def build(kind: Kind, database: Descriptors | Parts, *, seed: int = 0, quiet: bo
         kind: one of `KINDS`.
         database: unit descriptors, as `retrieval.search` takes them; or a function that yields them
             in parts, which is called for each of up to three passes.
-        seed: of the clustering and its sample, or of the layers of vectors in the graph.
-        quiet: no progress bar.
+        seed: seed of the clustering and its sample, or of the graph's layers.
+        quiet: whether to hide the progress bar.
 
     Raises:
         InputError: an unknown kind; an array that is empty or not a matrix; rows that are not
@@ -228,7 +228,7 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
 
 
 def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
-    """Read an index that `save_index` wrote; a note reports a missing checksum.
+    """Read an index that `save_index` wrote; warn of a missing checksum.
 
     Args:
         path: the file.
@@ -279,7 +279,7 @@ _APPENDED_SIZE = len(_APPENDED) + 64 + 1
 
 
 def _check_appended(path: pathlib.Path) -> None:
-    """Check the digest that `save_index` appended; a note reports a file without one.
+    """Check the digest that `save_index` appended; warn if there is none.
 
     Raises:
         InputError: the bytes of the file do not match the digest.

@@ -194,7 +194,7 @@ def best_products(products: Generator[Products, None, None], queries: int, k: in
     """Find the k largest of some exact products of each query; ties go to the lower indices.
 
     Args:
-        products: of all queries with at least k rows, in row order.
+        products: products of all queries with at least k rows, in row order.
         queries: number of queries.
         k: neighbours per query.
     """
@@ -213,7 +213,7 @@ def _largest(
     """Find the pairs with the `count` largest values of each query; see `_first`.
 
     Args:
-        products: of all queries with all blocks.
+        products: products of all queries with all blocks.
         least: products up to these are skipped; raised in place to the `count`-th value - `margin`.
         count: number of pairs per query.
         score: computes the values of pairs; None uses their products.

@@ -175,7 +175,7 @@ def fit_pca(
         seed: random seed of the draw.
         model: the `model_hash` of the model that made the descriptors; other models are refused.
         name: name of the descriptors in messages, such as their file.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The components, for `Pca.apply`.
@@ -300,7 +300,7 @@ def pca_hash(pca: Pca) -> str:
 
 
 def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
-    """Write the components as safetensors, with their configuration in the metadata.
+    """Save components as safetensors, with their configuration in the metadata.
 
     Args:
         path: the .safetensors file.

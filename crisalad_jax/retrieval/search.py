@@ -46,9 +46,8 @@ def search(
 
     The database may be a memory map that is larger than memory. It is read once, `chunk` rows at a
     time and one chunk ahead; the best rows are then read again. Apart from the inputs, memory holds
-    three chunks and their similarities to 1,024 queries, whatever the size of the database. Pages
-    of a memory map are released after use. If queries have many near copies in the database, it is
-    read a second time.
+    three chunks and their similarities to 1,024 queries. Pages of a memory map are released after
+    use. If queries have many near copies in the database, it is read a second time.
 
     Float32 products select candidates; NumPy computes them on a CPU, the devices otherwise. The
     final similarity of a candidate is summed in float64 and rounded to float32, so its bits depend
@@ -62,9 +61,9 @@ def search(
             a .npy file stores as two untyped bytes, "V2"), or in another type that is converted to
             float32; or bits from `pack_bits`.
         queries: unit descriptors of the q queries, or their bits.
-        k: neighbours per query, or all n images of a smaller database.
+        k: number of neighbours per query, at most n.
         chunk: database rows compared at a time, rounded up to a multiple of the devices.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         Indices into the database and similarities, (q, k), best first.

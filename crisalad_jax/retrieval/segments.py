@@ -60,9 +60,9 @@ class Segments:
         """Read all records, and check that the store has their rows.
 
         Args:
-            folder: of the records.
-            store: of the rows.
-            dtype: of the rows.
+            folder: folder of the records.
+            store: store of the rows.
+            dtype: type of the rows.
             take: called with each record and its file in order, now and when one is appended.
                 Records of segments have the `names` of their rows, those of changes the number of
                 `rows` after them. By default, records are appended to `records`.

@@ -97,8 +97,8 @@ class SeqSlam:
         """Take the next frame into account.
 
         Args:
-            state: after the previous frame.
-            similarities: of the frame to every image of the map: cosines of descriptors.
+            state: state after the previous frame.
+            similarities: cosine similarities of the frame to every image of the map.
             moved: not used, since lines count frames.
 
         Returns:

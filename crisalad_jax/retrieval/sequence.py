@@ -118,7 +118,7 @@ class BayesFilter:
         """Move a belief from one frame to the next, by the motion model.
 
         Args:
-            state: after the previous frame.
+            state: state after the previous frame.
             moved: as in `step`.
 
         Returns:
@@ -140,8 +140,8 @@ class BayesFilter:
         """Take the next frame into account.
 
         Args:
-            state: after the previous frame.
-            similarities: of the frame to every image of the map: cosines of descriptors.
+            state: state after the previous frame.
+            similarities: cosine similarities of the frame to every image of the map.
             moved: seconds or metres since the previous frame, as in the map's `along`, or frames
                 for a map that counts images; infinity if unknown.
 
@@ -172,10 +172,10 @@ class BayesFilter:
         """Follow a camera through all frames of a sequence.
 
         Args:
-            similarities: of every frame, in order, to every image of the map.
+            similarities: similarities of every frame, in order, to every image of the map.
             common: as in `start`.
             along: as in `start`.
-            moved: of every frame, as in `step`; None is one frame each.
+            moved: motion to every frame, as in `step`; None is one frame each.
 
         Returns:
             The best place at each frame, given that frame and those before it.

@@ -73,8 +73,8 @@ def write_synthetic_city(
 
     Args:
         root: a folder that does not exist, or is empty, or holds this city.
-        config: how many places, the size of their images, the seed.
-        quiet: no progress bar.
+        config: size and seed of the city.
+        quiet: whether to hide the progress bar.
 
     Returns:
         Whether it was written; False if it was there already.

@@ -42,7 +42,7 @@ def write_set(root: str | os.PathLike[str], config: Any, files: Files, *, quiet:
         root: a folder that does not exist, or is empty, or holds this set.
         config: the set's configuration, a dataclass; it is stored as set.json in the folder.
         files: the files of the set.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         Whether it was written; False if it was there already.

@@ -52,10 +52,10 @@ def render(
     """Draw one picture of a place, RGB. The same arguments give the same pixels.
 
     Args:
-        place_seed: which place; at least 0.
+        place_seed: seed of the place, at least 0.
         view: where the camera stands, and the season, light, weather and traffic it meets.
         image_size: height and width in pixels.
-        scenery: what kind of place it is.
+        scenery: kind of place.
 
     Raises:
         InputError: a negative seed, or a size out of range.

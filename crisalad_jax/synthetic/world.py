@@ -44,7 +44,7 @@ _FIELDS: dict[Variation, tuple[str, ...]] = {
 """Fields of `View` that belong to a variation, where it is not the field of the same name."""
 _SCENES_PER_CITY = 12
 _SPACING = 100.0
-"""Metres between places as the files give them; stations of a scene are really closer."""
+"""Metres between places in the files; stations of a scene are closer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,8 +64,8 @@ class WorldConfig:
     repaint: Repaint = 0.3
     """Largest `View.repaint`."""
     varied: tuple[Variation, ...] = VARIATIONS
-    """What varies between the training images of a place. The rest is as in a plain `View`, the
-    stand as in the scene's camera. Test images vary in all of these."""
+    """What varies between the training images of a place. The rest is as in a plain `View`; without
+    "stand", the camera is the scene's. Test images vary in all of these."""
     hard: Annotated[float, limited(0, 1)] = 0.3
     """Share of the images taken from far to the side, turned, or through a crowd."""
     seed: Seed = 0
@@ -90,8 +90,8 @@ def write_world(root: str | os.PathLike[str], config: WorldConfig, *, quiet: boo
 
     Args:
         root: a folder that does not exist, or is empty, or holds this world.
-        config: how many scenes and images, their size, the seed.
-        quiet: no progress bar.
+        config: size and seed of the world.
+        quiet: whether to hide the progress bar.
 
     Returns:
         Whether it was written; False if it was there already.

@@ -1,4 +1,4 @@
-"""Callbacks, which receive the numbers of a run and can stop it."""
+"""Callbacks, which receive the metrics of a run and can stop it."""
 
 import csv
 import importlib
@@ -64,10 +64,10 @@ class Callback:
         """
 
     def on_step(self, numbers: Numbers) -> None:
-        """Handle a step, with the numbers of its line in metrics.jsonl: step, epoch, loss, ..."""
+        """Handle a step, with the metrics of its line in metrics.jsonl: step, epoch, loss, ..."""
 
     def on_validation(self, numbers: Numbers) -> None:
-        """Handle a validation, with the numbers of its line: step, epoch, R@1, ..."""
+        """Handle a validation, with the metrics of its line: step, epoch, R@1, ..."""
 
     def on_end(self, result: "FitResult") -> None:
         """Handle the end of a run; not called after an error or a signal."""
@@ -201,7 +201,7 @@ class WandbCallback(Callback):
         self._wandb.init(name=out.absolute().name, config=to_plain(config), **options)
 
     def on_step(self, numbers: Numbers) -> None:
-        """Log the numbers."""
+        """Log the metrics."""
         self._wandb.log(dict(numbers), step=numbers["step"])
 
     on_validation = on_step
@@ -230,7 +230,7 @@ class MlflowCallback(Callback):
         self._mlflow.log_dict(to_plain(config), "config.json")
 
     def on_step(self, numbers: Numbers) -> None:
-        """Log the numbers, under the same tags as for TensorBoard."""
+        """Log the metrics, under the same tags as for TensorBoard."""
         metrics = {name.replace("@", ""): value for name, value in numbers.items()}
         self._mlflow.log_metrics(metrics, step=int(numbers["step"]))
 

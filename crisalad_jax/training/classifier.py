@@ -33,8 +33,8 @@ def init_classifiers(
     """Initialise a loss's parameters for each group; return None if it has none.
 
     Args:
-        key: draws them.
-        loss: the loss that has the parameters.
+        key: random key.
+        loss: the loss.
         classes: number of classes of each group; empty if there are no classes.
         dim: width of a descriptor.
 
@@ -85,7 +85,7 @@ def update_classifiers(
 
 @takes(path=PATH)
 def load_loss(path: str | os.PathLike[str]) -> tuple[LossConfig, PyTree]:
-    """Read the loss that a run trained with, and the parameters that it learnt.
+    """Read the loss of a run and its learnt parameters.
 
     `load` reads the model of the same file. A run that starts from the file initialises the
     parameters of its loss again. Those of a loss that classifies, a vector for each class of the

@@ -54,15 +54,15 @@ class OptimiserConfig:
     warmup_epochs: NonNegativeInt = 0
     """Epochs of warm-up, instead of `warmup_steps`."""
     weight_decay: NonNegativeFloat = 0.01
-    """Torch's default for AdamW; the paper gives none. Optimisers without a weight decay of their
-    own add it to the gradient, as torch's Adam and SGD do."""
+    """Weight decay, by default torch's for AdamW; the paper gives none. Optimisers without a weight
+    decay add it to the gradient, as torch's Adam and SGD do."""
     clip_norm: PositiveFloat | None = None
     """Maximum norm of the whole gradient."""
     clip_value: PositiveFloat | None = None
     """Maximum absolute value of a gradient element, after `clip_norm`."""
     accumulate: PositiveInt = 1
-    """Number of batches whose gradients are averaged for one optimiser step. The steps above count
-    these. As in Lightning, the last batch of an epoch also steps; the sum of the remaining
+    """Number of batches whose gradients are averaged for one optimiser step. `warmup_steps` counts
+    these steps. As in Lightning, the last batch of an epoch also steps; the sum of the remaining
     gradients is divided by the same number."""
     ema: Fraction | None = None
     """Decay of an exponential moving average of the weights per optimiser step, such as 0.999;
@@ -90,9 +90,9 @@ class MiningConfig:
     """
 
     kind: Literal["none", "whole", "sample"] = "none"
-    """What is described: nothing, for training sets of places; the "whole" database, from which
-    each query draws its own candidates, plus its previous negatives (NetVLAD); or a "sample" of
-    candidates for all queries of the round, and their positives (MSLS)."""
+    """Database images that a round describes: "none", for training sets of places; the "whole"
+    database, of which each query draws its own candidates, plus its previous negatives (NetVLAD);
+    or a "sample" of candidates for all queries of the round, and their positives (MSLS)."""
     negatives: PositiveInt = 10
     """Negatives per tuple: the nearest candidates."""
     candidates: PositiveInt = 1000
@@ -100,7 +100,7 @@ class MiningConfig:
     queries_per_round: PositiveInt = 1000
     """Maximum queries per round; an epoch is divided into rounds of equal size."""
     queries_per_epoch: PositiveInt | None = None
-    """Queries per epoch, redrawn for each round; None takes every query at most once."""
+    """Queries per epoch, sampled for each round; None takes every query at most once."""
     positive_radius: float = 10.0
     """Metres within which a database image is a query's positive."""
     negative_radius: float = 25.0
@@ -121,7 +121,7 @@ class MiningConfig:
 @short_repr("name")
 @dataclasses.dataclass(frozen=True)
 class MixtureSet:
-    """One of several training sets that are trained on together, with its sub-batch of each step.
+    """One training set of a mixture, of which each step takes a sub-batch.
 
     Example:
         >>> MixtureSet("msls", sampler="cliques", weight=0.5)
@@ -165,9 +165,9 @@ class TrainConfig:
     )
     """By default the paper's AdamW, with a decay "as adopted in SALAD": to 0.2 in 4,000 steps."""
     trainable: str = ADAPTERS_AND_HEAD
-    """What trains, a comma list: adapters,head (the paper); last-N-blocks,norm,head (SALAD); all;
-    or patterns of names, as in adapters,head,backbone.blocks.1[01]. A leading - freezes a word or
-    pattern, as in head,-adapters; see `split_params`."""
+    """What trains, comma-separated: adapters,head (the paper); last-N-blocks,norm,head (SALAD);
+    all; or patterns of names, as in adapters,head,backbone.blocks.1[01]. A leading - freezes a word
+    or pattern, as in head,-adapters; see `split_params`."""
     batch_norm: Literal["batch", "stored"] = "batch"
     """Statistics of the backbone's batch norms. "batch" normalises by those of the batch and
     updates the running ones (torch's `train()`, in frozen layers too). "stored" normalises by the
@@ -177,17 +177,17 @@ class TrainConfig:
     places_per_batch: PositiveInt = 48
     """Number of places in a batch, or of classes if the loss classifies."""
     images_per_place: PositiveInt = 4
-    """Number of images of each."""
+    """Number of images of each place or class."""
     micro_batch: int | None = None
-    """Images whose activations are in memory at a time: a step needs less memory but a longer
-    forward pass, with the same result. On a CPU a convolutional backbone takes ten times as long or
-    more: XLA's loops have no fast convolutions. None is the whole batch. With "batch" statistics,
-    batch norms use those of each micro-batch, as in several forward passes of torch."""
+    """Number of images that pass through the backbone at a time: a step takes less memory and more
+    time, with the same result. On a CPU a convolutional backbone takes ten times as long or more:
+    XLA's loops have no fast convolutions. None is the whole batch. With "batch" statistics, batch
+    norms use those of each micro-batch, as in several forward passes of torch."""
     min_images: int = 4
     """Places, or classes, with fewer images are left out."""
     mining: MiningConfig = MiningConfig()
-    """Tuples of a set of queries, instead of places. A batch is then `places_per_batch` tuples,
-    each of `images_per_place` images: a query, a positive, and the negatives."""
+    """Mining of tuples from a set of queries, instead of places. A batch is then `places_per_batch`
+    tuples, each of `images_per_place` images: a query, a positive, and the negatives."""
     sampler: OrName[Sampler] = part_field(SAMPLERS, "within-city")
     """Which places make a batch; a registered sampler, or its name."""
     mixture: tuple[MixtureSet, ...] = ()
@@ -202,8 +202,8 @@ class TrainConfig:
     validate_every: PositiveInt = 1
     """Epochs from one validation to the next."""
     validation_size: tuple[int, int] | None = None
-    """Height and width that validations resize to; None is the model's. The saved model keeps its
-    own."""
+    """Height and width that validations resize to; None is the model's. The saved model does not
+    change."""
     monitor: Literal["R@1", "R@5", "R@1+R@5"] = "R@5"
     """Validation recall that selects the best weights."""
     patience: PositiveInt | None = 3
@@ -211,7 +211,7 @@ class TrainConfig:
     save_top_k: PositiveInt = 1
     """Number of validations whose weights are saved, by best recall."""
     seed: Seed = 0
-    """Seeds weights, batches and augmentations."""
+    """Seed of weights, batches and augmentations."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""

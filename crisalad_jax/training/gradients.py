@@ -39,17 +39,17 @@ def gradient_norms(
     *,
     key: PRNGKeyArray | None = None,
 ) -> dict[str, float]:
-    """Compute the norm of the gradient of a batch's loss for each part of the model that trains.
+    """Compute the norm of the gradient of a batch's loss for each trainable part of the model.
 
-    The loss and what trains are the configuration's, as in a step of training. The squares of all
-    norms add up to the square of `Metrics.gradient_norm`.
+    The loss and the trainable parameters are those of the configuration. The squares of all norms
+    add up to the square of `Metrics.gradient_norm`.
 
     Args:
         params: the whole model.
         images: a batch, as `training_batches` yields it.
-        labels: the place number of each image.
-        config: the run's configuration; another `trainable`, such as "all", shows other parts.
-        key: draws the dropout, and the loss's parameters, if it has any; None disables dropout.
+        labels: the place of each image.
+        config: the run's configuration; `trainable="all"` shows all parts.
+        key: random key for dropout and for the loss's parameters; None disables dropout.
 
     Returns:
         Euclidean norms by name, in the order of the model: `backbone.blocks.3` for a block,

@@ -95,29 +95,29 @@ def fit(
     validation adds `best.safetensors`, the weights of the best recall by `config.monitor` (grouping
     `single`), and the best `config.save_top_k` weights in `best/`.
 
-    A run in `out` with fewer epochs is extended to those of `config`, which must be the same
-    otherwise. If the learning rate depends on the run's length, a warning says where it jumps.
+    A run in `out` with fewer epochs is extended; everything else in `config` must be the same. If
+    the learning rate depends on the run's length, a warning says where it jumps.
 
     A run that is killed at any moment and resumed gives bit-identical results to an uninterrupted
     one (on a CPU; see docs/reliability.md for a GPU).
 
     Args:
-        config: everything except the files.
+        config: the training configuration.
         places: training images; a `QuerySet` if `config.mining` mines tuples; or the sets of
             `config.mixture`, by name.
         out: folder of the run.
-        validation: evaluated every `config.validate_every` epochs, for early stopping.
+        validation: evaluation set, used every `config.validate_every` epochs.
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them; validations
             leave them out.
         num_threads: threads that decode images; None is one per core that this process may use.
-        shard_state: shard what trains and its moments over devices, instead of replicating them.
+        shard_state: whether to shard trainable parameters and their moments over the devices.
         cache_gb: maximum gigabytes (1e9 bytes) of remote images cached on this host's disk, in the
             folder `images` of this package's cache; 0 caches none.
-        callbacks: called with the numbers of each step and validation, in the primary process; or
+        callbacks: called with the metrics of each step and validation, in the primary process; or
             names of registered ones. If one raises `StopTraining`, the run ends; the same call
             resumes it.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
         targets: a teacher's unit descriptor of each image of `places`, possibly a memory map, for a
             loss that learns from them; an image with zeros is left out.
 

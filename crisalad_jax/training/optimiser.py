@@ -25,7 +25,7 @@ def count_steps(config: OptimiserConfig, batches: _Count, batches_per_epoch: int
     """Count the optimiser's steps in the first `batches` batches of a run.
 
     Args:
-        config: the optimiser.
+        config: the optimiser's configuration.
         batches: number of batches, which is also the index of the next one.
         batches_per_epoch: number of batches of an epoch, the last of which always steps.
 
@@ -44,7 +44,7 @@ def warmup_length(config: OptimiserConfig, steps_per_epoch: int) -> int:
     """Return the length of a warm-up in optimiser steps, even if it is given in epochs.
 
     Args:
-        config: the optimiser.
+        config: the optimiser's configuration.
         steps_per_epoch: number of batches of an epoch.
 
     Example:
@@ -61,7 +61,7 @@ def learning_rate_schedule(
     """Make a linear warm-up, followed by `config.schedule`.
 
     Args:
-        config: the optimiser.
+        config: the optimiser's configuration.
         steps: number of batches of the run.
         steps_per_epoch: number of batches of an epoch.
 
@@ -99,7 +99,7 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
     """Shorten a warm-up to the largest allowed share of a run.
 
     Args:
-        config: the optimiser.
+        config: the optimiser's configuration.
         steps: number of batches of the run.
         steps_per_epoch: number of batches of an epoch.
 
@@ -140,7 +140,7 @@ def make_optimiser(
     share a step, their mean gradient). The average of `config.ema` comes last.
 
     Args:
-        config: the optimiser.
+        config: the optimiser's configuration.
         steps: number of batches of the run.
         steps_per_epoch: number of batches of an epoch.
 

@@ -63,7 +63,7 @@ def read_inputs(
         weights: see `read_start`.
         backbone: see `read_start`.
         on_bad_image: "stop", or "skip" to leave unreadable images out.
-        quiet: no progress bars.
+        quiet: whether to hide progress bars.
         **grouping: how images become places; see `read_places`.
 
     Returns:
@@ -156,7 +156,7 @@ def read_start(
         weights: a complete model of this package, or the name of a published model.
         backbone: a checkpoint from which only the backbone is taken, public or of this package, or
             the name of a published model.
-        quiet: no download progress bar.
+        quiet: whether to hide the progress of a download.
 
     Returns:
         All parameters; None, which stands for random ones, if neither is given.

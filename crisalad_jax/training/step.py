@@ -1,4 +1,4 @@
-"""One compiled step of training: the loss, its gradient, and the optimiser (paper section 4.2)."""
+"""One compiled training step: the loss, its gradient, and the optimiser (paper section 4.2)."""
 
 import dataclasses
 import functools
@@ -38,19 +38,19 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
 WHOLE_LOSS = 1024
-"""Most images for which every device computes the whole loss, at most a hundredth of a step's work
-(docs/training.md). For more images, XLA splits the loss and exchanges its parts."""
+"""Maximum images for which every device computes the whole loss, at most a hundredth of a step's
+work (docs/training.md). For more images, XLA splits the loss and exchanges its parts."""
 LossFunction = Callable[..., Float[Array, ""]]
 """Takes descriptors, labels and, if it has a third argument, which images are valid."""
 
 
 @brief
 class TrainState(NamedTuple):
-    """State that changes from step to step."""
+    """The part of a training run that each step updates."""
 
     step: Int[Array, ""]
     trainable: PyTree
-    """Parameters that train, and running statistics that are updated; None for all others."""
+    """Trainable parameters and updated running statistics; all other leaves are None."""
     optimiser: PyTree
     classifiers: Classifiers | None = None
     """Parameters of the loss, if it has any."""
@@ -163,21 +163,21 @@ class StepConfig:
 def init_train_state(
     params: Crisalad, trainable: str, config: StepConfig, *, key: PRNGKeyArray | None = None
 ) -> tuple[TrainState, PyTree]:
-    """Make the state before the first step, and the frozen parameters, which no step changes.
+    """Make the initial training state, and split off the frozen parameters.
 
     Warn if the warm-up takes more than a quarter of the run.
 
     Args:
-        params: the model to start from.
+        params: parameters to start from.
         trainable: see `split_params`.
         config: the step's configuration, from `step_config`.
-        key: draws the parameters of the loss, if it has any.
+        key: random key for the parameters of the loss, if it has any.
 
     Returns:
         (state, frozen). The state is a copy, so `params` can still be used.
 
     Raises:
-        InputError: what `split_params` raises; nothing in the model trains, as in AnyLoc's, whose
+        InputError: what `split_params` raises; no parameter would train, as with AnyLoc, whose
             vocabulary fits one backbone; or the loss needs a key, or classes.
 
     Example:
@@ -274,10 +274,10 @@ def step_config(
 
 @takes(config=StepConfig)
 def make_train_step(config: StepConfig) -> Callable[..., tuple[TrainState, Metrics]]:
-    """Make a compiled step of training.
+    """Make a compiled training step.
 
     Args:
-        config: from `step_config`, as `init_train_state` takes it.
+        config: from `step_config`, the same as for `init_train_state`.
 
     Returns:
         `step(state, frozen, images, labels, key, valid=None, targets=None) -> (state, metrics)`;
@@ -425,13 +425,13 @@ def loss_and_gradient(
         images: see `train_step`.
         labels: see `train_step`.
         valid: see `train_step`.
-        key: draws the dropout; None disables it.
+        key: random key for dropout; None disables it.
         config: the step's configuration.
         targets: a teacher's descriptors, for a loss that reads them.
 
     Returns:
-        The results of the forward pass, and the gradients of what trains and of the loss's
-        parameters.
+        The results of the forward pass, and the gradients of the trainable parameters and of the
+        loss's parameters.
     """
     classifier, group = None, _group(state, config)
     if state.classifiers is not None:

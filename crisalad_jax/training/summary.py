@@ -50,7 +50,7 @@ def model_summary(
     """Count a model's parameters and multiply-accumulates, without running it.
 
     Args:
-        config: the model.
+        config: the model's configuration.
         trainable: what trains, as `split_params` takes it. None is the adapters and the head, or
             only the head if there are no adapters.
         images: number of images that attend to each other in the cross-image encoder.
@@ -93,7 +93,7 @@ def model_words(config: ModelConfig) -> str:
     """Describe a model's parts and its descriptor in one line.
 
     Args:
-        config: the model.
+        config: the model's configuration.
 
     Returns:
         Clauses without a full stop.

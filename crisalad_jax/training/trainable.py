@@ -39,9 +39,9 @@ def terms_of(trainable: str) -> list[str]:
 def shards_batch(trainable: str) -> bool:
     """Return whether a batch is sharded over devices: not on a CPU if all parameters train.
 
-    Each device holds its own copy of what trains, of the gradient and of the moments. If all
-    parameters train, these copies take most of the memory, which a CPU's devices share; `tiny`
-    saves no time by sharding (docs/performance-studies.md).
+    Each device holds its own copy of the trainable parameters, of the gradient and of the moments.
+    If all parameters train, these copies take most of the memory, which a CPU's devices share;
+    `tiny` saves no time by sharding (docs/performance-studies.md).
     """
     return trainable != ALL or target().platform != "cpu"
 
@@ -49,27 +49,28 @@ def shards_batch(trainable: str) -> bool:
 def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple[PyTree, PyTree]:
     """Split parameters into those that train and those that are frozen.
 
-    `trainable` is a comma list of words and patterns:
+    `trainable` is a comma-separated list of words and patterns:
 
     - `all`; `head` (aggregator, cross-image encoder and projection); `adapters` (what the backbone
       marks as trainable, `Backbone.trains`); `last-N-blocks`; `norm` (the last layer norm, if the
-      aggregator asks for it); `positions` (class token and position embeddings).
+      aggregator uses it); `positions` (class token and position embeddings).
     - A pattern of dotted names, matched like file names: `*` is any text, `[01]` one of two
-      characters. It matches parameters, or all that is below a name. Blocks are numbered from 0, as
-      in `backbone.blocks.1[01]`; without a number, `backbone.blocks.attn` matches in all blocks.
+      characters. It matches a parameter, or a part with all its parameters. Blocks are numbered
+      from 0, as in `backbone.blocks.1[01]`; without a number, `backbone.blocks.attn` matches in all
+      blocks.
     - A leading `-` freezes a word or pattern.
 
     The paper trains "adapters,head", SALAD "last-4-blocks,norm,head".
 
-    If blocks differ in what trains, the backbone's stack is cut, and `merge_params` joins it. So no
-    gradient is computed in frozen blocks before the first that trains, nor through all of that
-    block if only a part of it trains. Batch-norm statistics have no gradient and count as frozen,
-    though a step may update them. So does an aggregator that learns nothing (AnyLoc's vocabulary).
+    If only some parameters of the blocks train, the stack of blocks is cut; `merge_params` joins
+    it. No gradient is then computed in frozen blocks before the first trainable one, nor, if only a
+    part of that block trains, for its input. Batch-norm statistics have no gradient and count as
+    frozen, though a step may update them. So does an aggregator that learns nothing (AnyLoc's).
 
     Args:
         params: the whole model.
         config: the model's configuration.
-        trainable: what trains.
+        trainable: the list above.
 
     Returns:
         (trainable, frozen): two trees of the model's structure, with None for the other's leaves.
@@ -204,8 +205,8 @@ def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Cris
     """Join the two trees of `split_params` into the whole model.
 
     Args:
-        trainable: what trains.
-        frozen: what does not.
+        trainable: tree of the trainable parameters.
+        frozen: tree of the frozen parameters.
         config: the model's configuration.
 
     Returns:

@@ -114,7 +114,7 @@ class Trainer:
         """Wait for the started steps except the last `leave`.
 
         Yields:
-            The numbers to log for each step.
+            The metrics to log for each step.
 
         Raises:
             InputError: no image of a step could be read.

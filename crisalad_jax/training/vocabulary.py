@@ -64,11 +64,12 @@ def with_vocabulary(
         model: a model with its final backbone, or the one that training starts from, and an
             aggregator that starts from centroids.
         paths: images; not those used for evaluation.
-        images: largest number of them, drawn at random; None for all, with all features in memory.
-        seed: draws the images, `PATCHES` patches of each, and the first centroids.
-        batch_size: images described at a time.
+        images: maximum number of images, drawn at random; None for all, whose features must fit in
+            memory.
+        seed: seed of the images, of `PATCHES` patches of each, and of the first centroids.
+        batch_size: number of images described at a time.
         on_bad_image: "stop", or "skip" to leave unreadable images out.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The parameters with the centroids.
@@ -194,7 +195,7 @@ def build_vocabulary(
         images: the folder, searched with its subfolders, or another source of images
             (docs/how-to/image-sources.md), or a list of files; not images used for evaluation.
         out: the .safetensors file to write.
-        fps: frames per second of a video or log, which `images` must then be; None is one.
+        fps: frames per second, if `images` is a video or log; None is 1.
         topic: the image topic of a robot log; None takes the only one.
         max_images: largest number of images to read, drawn at random.
         seed: random seed, as in `with_vocabulary`.
@@ -283,7 +284,7 @@ def k_majority(
     Args:
         features: features of two values; see `Backbone.binary`.
         clusters: number of centroids.
-        seed: draws the first centroids.
+        seed: seed of the first centroids.
     """
     size = np.abs(features).max()
     bits = np.sign(features).astype(np.float32)

@@ -40,7 +40,7 @@ CONNECT, ANSWER, START, RESULT = 60.0, 120.0, 300.0, 1800.0
 """Seconds to wait at most: for a cluster, for its nodes' answers, for the first worker, and for any
 worker's result."""
 _REASON = 300
-"""Most characters to quote from Ray's message about the end of a worker."""
+"""Maximum characters to quote from Ray's message about the end of a worker."""
 _STARTS = -1
 """In place of an item's number: its worker is starting."""
 _TRIES = 5

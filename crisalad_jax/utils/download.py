@@ -58,7 +58,7 @@ def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False)
         url: the address, of http, https or file.
         target: the file, in an existing folder that no other process writes to.
         label: text in front of the progress bar.
-        quiet: no progress bar.
+        quiet: whether to hide the progress bar.
 
     Raises:
         MissingFileError: the file does not exist.

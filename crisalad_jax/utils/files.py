@@ -24,7 +24,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 LARGEST = 2**30
-"""Most bytes of a file that is read into memory, such as a text or an image: a sparse file may
+"""Maximum bytes of a file that is read into memory, such as a text or an image: a sparse file may
 claim any number."""
 LARGEST_TEXT, _LARGEST_JSON = 2**27, 2**26
 """The same for texts and JSON, whose characters and values take many times as much memory."""
@@ -48,7 +48,7 @@ def check_source(
     Args:
         path: the file.
         expected: what kind of file, for messages.
-        largest: most bytes that it may have; None is any number.
+        largest: maximum size in bytes; None is any.
 
     Raises:
         InputError: there is none, it is larger, or it is not a file but a folder, a pipe or a
@@ -105,7 +105,7 @@ def read_bytes(path: str | os.PathLike[str], expected: str, *, largest: int = LA
     Args:
         path: the file.
         expected: what kind of file, for messages.
-        largest: most bytes that it may have.
+        largest: maximum size in bytes.
 
     Raises:
         InputError: what `check_source` raises.

@@ -78,7 +78,7 @@ def download_file(
         address: the repository and the file.
         is_dataset: whether it is a dataset repository.
         folder: where to store the file, under its path in the repository; None is the hub's cache.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The file.
@@ -113,7 +113,7 @@ def upload_folder(
         folder: the folder.
         address: the repository.
         message: the commit message.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The address of the repository's page.
@@ -150,9 +150,9 @@ def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -
     """Download a data set from Kaggle, unpacked.
 
     Args:
-        handle: as OWNER/NAME.
+        handle: the data set, as OWNER/NAME.
         folder: a folder for its client's cache, from which the next call resumes.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The folder with the set's files, in the cache.

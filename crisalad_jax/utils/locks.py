@@ -35,7 +35,7 @@ def lock(folder: str | os.PathLike[str], *, wait: float = 0.0) -> Iterator[None]
 
     Args:
         folder: the folder.
-        wait: seconds to wait for another process that holds it, with a note.
+        wait: seconds to wait for another process that holds it, with a warning.
 
     Raises:
         InputError: another process holds it, and the message says which, on which host; or the

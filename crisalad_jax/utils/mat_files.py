@@ -26,7 +26,7 @@ def load_mat(
         path: the file.
         expected: what kind of file, for messages.
         damaged: what the message calls a file that scipy cannot read.
-        largest: most bytes that it may have, compressed or not.
+        largest: maximum size in bytes, compressed or not.
         **options: options of `scipy.io.loadmat`.
 
     Raises:

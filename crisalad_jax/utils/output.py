@@ -10,7 +10,7 @@ _PACKAGE = __name__.partition(".")[0]
 
 
 _LONGEST = 8192
-"""Most characters of a message, which may quote a path or a value of any length."""
+"""Maximum characters of a message, which may quote a path or a value of any length."""
 
 
 class Note(UserWarning):

@@ -36,9 +36,9 @@ def progress_bar(
     """Show the progress of long work while the block runs; without rich, only its messages.
 
     Args:
-        label: what the work is.
+        label: name of the work.
         total: number of units.
-        unit: what is counted, for the rate.
+        unit: name of the unit, for the rate.
         quiet: whether to show nothing.
         done: units that were done before, which do not count for the rate.
     """

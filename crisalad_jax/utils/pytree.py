@@ -134,7 +134,7 @@ def named_leaves(tree: Any) -> dict[str, Any]:
 
 
 _MOST = 24
-"""Most lines of a printed tree, unless it has more top-level names."""
+"""Maximum lines of a printed tree, unless it has more top-level names."""
 
 
 def summary(tree: Any) -> str:

@@ -1,4 +1,4 @@
-"""Signals that end a program: at once, or after its work is saved.
+"""Signals that end a program: immediately, or after its work is saved.
 
 This module imports nothing but the standard library, so that the command line can handle signals
 before it imports anything else.
@@ -131,7 +131,7 @@ class SignalState:
         self.number = 0
         """Number of the last signal; 0 for none."""
         self.has_work = False
-        """Whether there is work that has to be saved; without it a command ends at once."""
+        """Whether there is work that has to be saved; without it a command ends immediately."""
         self._at_once = False
         self._before = before or {}
 

@@ -74,7 +74,7 @@ class Format:
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     """Fields that shapes do not show, by part."""
     adjust: Callable[[State, ModelConfig], ModelConfig] = lambda state, config: config
-    """Function that sets what else a state shows of its model."""
+    """Function that sets the other fields that a state shows."""
     inside: str = ""
     """Key of the file's dictionary that holds the state, a slash, and a prefix of all names, as
     torch's DataParallel adds it; empty: the file is the state."""

@@ -31,7 +31,7 @@ def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
 
     Settings that shapes do not show are the published ones: heads of width 64 in the backbone, 16
     heads in the encoder, alpha 0.2, three Sinkhorn iterations, the family's image size and resize.
-    Names of wrappers are removed; a note says how many other tensors are left out.
+    Names of wrappers are removed; a warning counts other tensors that are left out.
 
     Returns:
         (format, configuration, the arrays by the format's own names).

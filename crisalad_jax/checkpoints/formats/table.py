@@ -50,7 +50,7 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
     """Check that a model can be written in a format and read back as the same model.
 
     Returns:
-        The configuration that is inferred from its file, which may have other free fields.
+        The configuration that is inferred from its file; its non-semantic fields may differ.
 
     Raises:
         InputError: what `table` raises; or a setting that shapes do not show differs from the

@@ -12,7 +12,7 @@ Image = UInt8[np.ndarray, "h w 3"]
 
 
 class Augmentation(Part, abc.ABC):
-    """A random change of training images: a frozen dataclass whose fields are its strengths.
+    """A random change of training images: a frozen dataclass whose fields are its settings.
 
     A plain function of (image, generator) is an augmentation without settings.
 

@@ -28,8 +28,8 @@ class Benchmark:
     database: tuple[pathlib.Path, ...]
     queries: tuple[pathlib.Path, ...]
     positives: tuple[Int64[np.ndarray, " _"], ...] | None
-    """Query -> ascending database indices; empty if the query has no match, which counts as a
-    miss. None if the set has no ground truth at all."""
+    """Database indices for each query, ascending; empty if it has no match, which counts as a miss.
+    None if the set has no ground truth at all."""
     rule: str
     """Rule that makes a database image positive, in words."""
     database_positions: Float64[np.ndarray, "database axis"] | None = None
@@ -91,7 +91,7 @@ def leave_out_unreadable(benchmark: Benchmark, *, quiet: bool = False) -> Benchm
 
     Args:
         benchmark: the set.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
 
     Raises:
         InputError: what `Benchmark.of_readable` raises.

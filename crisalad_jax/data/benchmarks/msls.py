@@ -63,7 +63,7 @@ def read_msls(
     Args:
         root: the folder with `train_val/`, or `train_val/` itself.
         split: `val` (the default) or `train`; its cities that are in the folder are read.
-        radius: in metres, inclusive. Images of different cities never match.
+        radius: radius of positives in metres, inclusive. Images of different cities never match.
         max_heading_difference: largest difference of two compass angles in degrees, inclusive, for
             a match (the CriSALAD paper says 40); None allows any, as the official code does.
         subtask: whether to read only the subtask `all`.

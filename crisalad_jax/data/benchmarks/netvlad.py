@@ -34,8 +34,8 @@ def read_netvlad(
     """Read a `.mat` file of NetVLAD; a positive is at most `radius` metres away.
 
     Args:
-        path: for instance `pitts30k_test.mat`.
-        radius: in metres, inclusive; None takes the file's posDistThr.
+        path: the file, such as `pitts30k_test.mat`.
+        radius: radius of positives in metres, inclusive; None takes the file's posDistThr.
         images: the folder with `000/...` (or `images/000/...`) and with the queries in
             `queries_real/`, `queries/` or `query/`; None looks in the file's folder and the one
             above.

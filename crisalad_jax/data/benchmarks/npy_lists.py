@@ -51,7 +51,7 @@ def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
     code in the file is run.
 
     The published lists of GardensPointWalking and 17places are windows of frames, and the last ones
-    extend past the last image. References past it are left out, and a note counts them.
+    extend past the last image. References past it are left out, and a warning counts them.
 
     Raises:
         InputError: a folder or the file is missing, a number is skipped among the images' names,
@@ -141,7 +141,7 @@ def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
     """Find the lists of each set in a folder, or of the set that a file belongs to.
 
     Returns:
-        Prefix of the files' names -> the files. Sets without a database or queries are left out.
+        The files by the prefix of their names. Sets without a database or queries are left out.
     """
     one = _FILE.fullmatch(root.name) if root.is_file() else None
     sets: dict[str, _Lists] = collections.defaultdict(dict)

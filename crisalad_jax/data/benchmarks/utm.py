@@ -57,7 +57,7 @@ def read_utm(
         root: a folder with `images/{test,val,train}`, or one that itself holds `database/` and
             `queries/`; SVOX's database is in `gallery/`.
         split: None takes `test`, else `val`.
-        radius: in metres, inclusive.
+        radius: radius of positives in metres, inclusive.
         queries: the folder of the queries: SVOX has `queries`, `queries_night` and others. The
             benchmark's name says which, unless it is `queries`.
         ignore_zones: whether to compare coordinates of all zones as if in one plane, as the public

@@ -30,9 +30,9 @@ class Draw(NamedTuple):
     places_per_batch: int
     images_per_place: int
     epoch: int
-    """From 0."""
+    """Index of the epoch, from 0."""
     generator: np.random.Generator
-    """Draws the same for the same seed and epoch."""
+    """Random generator, the same for the same seed and epoch."""
     described: Int[np.ndarray, " n"]
     """Images of `Sampler.images_to_describe`; none if `Sampler.describes` is False."""
     descriptors: Float[np.ndarray, "n descriptor"]
@@ -113,8 +113,8 @@ def epoch_batches(
         sampler: a registered sampler, or its name.
         places_per_batch: number of places in a batch.
         images_per_place: number of images of each place.
-        seed: seeds the draws, together with the epoch.
-        epoch: number of the epoch, from 0.
+        seed: seed of the draws, together with the epoch.
+        epoch: index of the epoch, from 0.
         steps: number of batches; None takes what the sampler draws in a turn.
         describe: describes images; for samplers with `Sampler.describes`.
 

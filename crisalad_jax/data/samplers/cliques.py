@@ -58,7 +58,7 @@ class Cliques(Sampler):
         left, in_new_city = np.ones((2, len(places.names)), bool)
         groups: list[np.ndarray] = []
         taken: dict[int, list[np.ndarray]] = collections.defaultdict(list)
-        """City -> positions of its groups' images."""
+        """Positions of the groups' images, by city."""
         while left.any():
             some = in_new_city if in_new_city.any() else left
             first = self._first(np.flatnonzero(some), places, draw)

@@ -68,7 +68,7 @@ def check_set(
         expected: name of the set in `SETS` that it should be; None allows any, and a custom set
             then has nothing to compare with.
         read: whether to decode every image too.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The parts of the folder, with their problems.

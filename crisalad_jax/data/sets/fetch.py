@@ -33,9 +33,9 @@ def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> 
     The folder `to` appears when everything is complete.
 
     Args:
-        name: of a set in `SETS`.
+        name: name of a set in `SETS`.
         to: the folder, new or empty.
-        quiet: whether to show no progress bars.
+        quiet: whether to hide progress bars.
 
     Returns:
         The folder.

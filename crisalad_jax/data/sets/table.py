@@ -82,7 +82,7 @@ class PublishedSet:
     cities: tuple[str, ...] = ()
     """Cities of a set of training places."""
     renamed: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Files that are renamed for `evaluate`: old name -> new."""
+    """New names of files that are renamed for `evaluate`, by old name."""
     pairs: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Folders of database and queries; images with the same number show the same place."""
     frames: Mapping[str, Any] = dataclasses.field(default_factory=dict)

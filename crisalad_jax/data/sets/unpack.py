@@ -34,7 +34,7 @@ def unpack(archive: pathlib.Path, folder: pathlib.Path, *, quiet: bool = False) 
     Args:
         archive: the archive.
         folder: the folder to unpack into; it may exist.
-        quiet: whether to show no progress bar.
+        quiet: whether to hide the progress bar.
 
     Raises:
         InputError: it is damaged, contains something that the filter refuses, or does not fit on

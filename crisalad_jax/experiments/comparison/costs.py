@@ -140,7 +140,7 @@ def adapter_costs(
 
     Args:
         seconds: what `race` returns for `adapter_calls`; empty if nothing was measured.
-        memory: what `adapter_memory` returns, or empty.
+        memory: what `adapter_memory` returns; empty if nothing was measured.
     """
     costs = []
     for name in (*_PAPER_PARAMETERS, *sorted({*ADAPTERS} - {"none", *_PAPER_PARAMETERS})):

@@ -76,7 +76,7 @@ class ComparisonConfig:
     """Backbone that training starts from; None trains from random weights, as in `scratch`."""
     preset: str = "b14"
     epochs: PositiveInt | None = None
-    """Number of epochs; None is the recipe's, or `EPOCHS` from nothing."""
+    """Number of epochs; None is the recipe's, or `EPOCHS` from random weights."""
     image_size: tuple[int, int] | None = None
     resize: tuple[str, ...] = ()
     """Changes to how images are resized, as `ModelConfig.resized` takes them."""
@@ -232,8 +232,8 @@ def prepare(config: ComparisonConfig, *, quiet: bool = True) -> Prepared:
     """Read the sets and make and check all configurations, weights from files included.
 
     Args:
-        config: what to compare.
-        quiet: no progress bar while all images are read.
+        config: the comparison's configuration.
+        quiet: whether to hide the progress bar.
 
     Returns:
         The comparison.

@@ -55,7 +55,7 @@ class RunResult:
     training: dict[str, Any] | None = None
     """Steps and times of its training, once that is finished."""
     ranks: dict[str, dict[str, list[int]]] = dataclasses.field(default_factory=dict)
-    """Evaluation -> grouping -> rank of each query's first correct retrieval, from 1; 0 if none."""
+    """Rank (from 1; 0: none) of each query's first correct answer, by evaluation and grouping."""
 
     def write(self, folder: pathlib.Path) -> None:
         """Write it into the run's folder atomically."""

@@ -77,7 +77,7 @@ def compare(
     sets may be added.
 
     Args:
-        config: what to compare.
+        config: the comparison's configuration.
         out: the folder. In addition to the runs it holds table.md, table.csv, results.json and the
             page index.html.
         page: a Markdown page that gets the tables too, between its comments <!-- NAME --> and

@@ -53,7 +53,7 @@ def recall_curves(
     """Draw Recall@K in percent against K, one named line per curve.
 
     Args:
-        curves: name -> K -> fraction of the queries, 0 to 1.
+        curves: fractions of the queries, 0 to 1, by name and K.
         title: title above the picture.
         wide: whether it is for a page of its own, rather than one that is also read on phones.
 
@@ -201,7 +201,7 @@ def position_map(
     correct.
 
     Args:
-        positions: of all images, in metres.
+        positions: positions of all images, in metres.
         first: the first retrieval of each query, an index of the database.
         outcomes: what `outcomes_of` returns.
     """
@@ -253,7 +253,7 @@ def truth_cells(
     """Mark the cells of a similarity map that hold a query and one of its positives.
 
     Args:
-        positives: the database indices that are correct for each query.
+        positives: correct database indices of each query.
         database: number of images in the database.
         shape: shape of the similarity map.
     """
@@ -275,7 +275,7 @@ def similarity_matrix(
 
     Args:
         similarities: the map that `similarity.similarity_map` returns.
-        positives: the database indices that are correct for each of the q queries.
+        positives: correct database indices of each of the q queries.
         first: the first retrieval of each query; green if correct, red if not.
         outcomes: what `outcomes_of` returns.
         database: number of images in the database.

@@ -62,21 +62,20 @@ def show_retrievals(
     Args:
         found: answers of `query`, or one of the results of `evaluate`.
         benchmark: the evaluated benchmark, for a result.
-        queries: numbers of the queries to show, in this order. None takes half of them correct and
-            half wrong if that is known, spread evenly, so that the same input gives the same
-            picture.
+        queries: indices of the queries to show, in this order. None takes half of them correct and
+            half wrong if that is known, evenly spaced, not at random.
         rows: maximum number of queries shown if `queries` is None.
         columns: maximum number of retrievals shown for each.
-        root: folder of a map's images; None for where they were. A missing image is a grey box,
+        root: folder of a map's images; None is the original one. A missing image is a grey box,
             with a warning.
         title: title above the picture.
 
     Returns:
-        A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
+        A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
         InputError: `found` is neither; a result without its benchmark, or answers with one; no
-            query, or a number out of range; or an image that cannot be read.
+            query, or an index out of range; or an image that cannot be read.
 
     Example:
         >>> import numpy as np, pathlib

@@ -49,23 +49,23 @@ def show_attention(
 ) -> Picture:
     """Draw what the class token, or a patch, attends to in a block of a vision transformer.
 
-    Each panel has its own scale, from the least to the most that a patch gets, as in its title.
-    Attention to the class token and to registers is not drawn.
+    Each panel has its own colour scale, whose ends are in its title. Attention to the class token
+    and to registers is not drawn.
 
     Args:
-        image: a file, or 8-bit RGB or grey, as `prepare_image` takes it.
-        model: the model, as `load` returns it.
-        block: number of the block, from 0; negative numbers count from the last.
-        head: number of the head, from 0. None draws the mean over the heads, then each of them.
+        image: an image file, or an array that `prepare_image` takes.
+        model: a model from `load`.
+        block: index of the block, from 0; negative ones count from the last.
+        head: index of the head, from 0. None draws the mean over the heads, then each head.
         patch: row and column of the patch that attends, from 0; a white square marks it. None for
             the class token.
 
     Returns:
-        A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
+        A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: no such head or patch; what `attention_maps` raises; an image that cannot be
-            read, or one that the model cannot describe.
+        InputError: no such head or patch; what `attention_maps` raises; or an image that cannot be
+            read or described.
 
     Example:
         >>> import jax
@@ -125,17 +125,17 @@ def show_image_attention(
 ) -> Picture:
     """Draw which images attend to which in each layer of the cross-image encoder.
 
-    A row is an image that attends, a column one that it attends to. A cell is the share, averaged
-    over tokens and heads; for up to ten images it is written in percent. White is an even share,
-    one over the number of images.
+    A row is an image that attends, a column one that it attends to. A cell is the attention weight,
+    averaged over tokens and heads, and written in percent for up to ten images. White is one over
+    the number of images.
 
     Args:
-        images: files, or 8-bit RGB or grey, that are described together.
-        model: the model, as `load` returns it.
+        images: image files or arrays, which are described together.
+        model: a model from `load`.
         mask: see `describe`.
 
     Returns:
-        A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
+        A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
         InputError: no images, or several sizes if the model does not resize; what
@@ -208,7 +208,7 @@ def show_gradient_norms(norms: Mapping[str, float]) -> Picture:
         norms: what `gradient_norms` returns.
 
     Returns:
-        A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
+        A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
         InputError: `norms` is empty.
@@ -257,14 +257,14 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
     Each place has a colour and a mark, and thin lines join its descriptors to their mean.
 
     Args:
-        descriptors: at least three, of images of at most 36 places.
+        descriptors: at least three descriptors, of at most 36 places.
         places: name or number of the place of each descriptor.
 
     Returns:
-        A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
+        A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: what `project_to_plane` raises, more places, or not one for each descriptor.
+        InputError: what `project_to_plane` raises, too many places, or not one for each descriptor.
 
     Example:
         >>> import numpy as np

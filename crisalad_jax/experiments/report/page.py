@@ -64,7 +64,7 @@ def write_report(
         groupings: the results, at least one.
         model: the model, for the section on its transport, if it has one.
         model_name: name of the weights.
-        settings: those of an `evaluation_record`, shown collapsed.
+        settings: settings of an `evaluation_record`, shown collapsed.
         similarities: what `similarity.similarity_map` returns for the first grouping.
 
     Returns:
@@ -72,7 +72,7 @@ def write_report(
 
     Raises:
         InputError: no ground truth, an image that cannot be read, or files that cannot be written
-            (then none is).
+            (none is then written).
 
     Example:
         >>> import shutil

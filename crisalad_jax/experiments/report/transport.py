@@ -26,7 +26,7 @@ HEAT = "inferno"
 _OPACITY = 0.65
 _PIXELS = 480
 Image = str | os.PathLike[str] | Pixels
-"""A file, or 8-bit RGB or grey, as `prepare_image` takes it."""
+"""An image file, or an array that `prepare_image` takes."""
 
 
 @takes(model=Model)
@@ -38,11 +38,11 @@ def show_transport(image: Image, model: Model) -> Picture:
     middle panel.
 
     Args:
-        image: a file, or 8-bit RGB or grey, as `prepare_image` takes it.
-        model: the model, as `load` returns it.
+        image: an image file, or an array that `prepare_image` takes.
+        model: a model from `load`.
 
     Returns:
-        A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
+        A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
         InputError: the model's aggregator has no transport, parameters of another configuration,

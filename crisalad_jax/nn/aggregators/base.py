@@ -113,9 +113,9 @@ class Aggregator(Part, abc.ABC):
 
         Args:
             params: from `init`.
-            features: as requested by `features`.
+            features: the requested features.
             grid: rows and columns of patches.
-            key: for dropout, one for all images or one for each; None means inference.
+            key: random key for dropout, one for all images or for each; None means inference.
         """
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:

@@ -84,9 +84,9 @@ class SaladConfig(Aggregator):
     learn_epsilon: bool = False
     """Whether epsilon is learnt, with `epsilon` as initial value."""
     row_tau: float = 1.0
-    """1 fixes the patches' masses. Below 1 a Kullback-Leibler penalty of epsilon * tau / (1 - tau)
-    pulls them to their marginals. If both sides are free, high scores make masses overflow outside
-    the log domain."""
+    """Relaxation of the patches' masses: 1 fixes them; below 1 a Kullback-Leibler penalty of weight
+    epsilon * tau / (1 - tau) pulls them to their marginals. If both sides are relaxed, high scores
+    make masses overflow outside the log domain."""
     column_tau: float = 1.0
     """Like `row_tau`, for the masses of the clusters and the dustbin."""
     learn_tau: bool = False

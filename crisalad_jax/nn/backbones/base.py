@@ -43,11 +43,11 @@ class FeatureSpec:
     """The features that an aggregator requests; by default those after the last layer."""
 
     levels: tuple[int, ...] | None = None
-    """Blocks, counted from 1, whose output patches are concatenated. Several must include the last
-    block. None takes only the last."""
+    """Blocks, counted from 1 in ascending order, whose output patches are concatenated. None takes
+    only the last."""
     facet: Literal["token", "query", "key", "value"] = "token"
-    """Facet of the level's block: its output tokens, or queries, keys or values of its attention,
-    with the heads concatenated."""
+    """What to take from the block: its output tokens, or the queries, keys or values of its
+    attention, with the heads concatenated."""
     norm: bool = True
     """Whether the last layer norm is applied."""
     class_token: bool = False
@@ -60,7 +60,7 @@ class FeatureSpec:
     """Number of blocks after which the aggregator's own tokens are prepended to all others. None
     if it has none."""
     inserted: Float[Array, "inserted dim"] | None = None
-    """Those tokens, the same for every image, from `Aggregator.inserted`."""
+    """The aggregator's own tokens, the same for every image, from `Aggregator.inserted`."""
 
     def levels_of(self, depth: int) -> tuple[int, ...]:
         """Return the levels in a backbone of `depth` blocks.
@@ -104,7 +104,7 @@ class Backbone(Part, abc.ABC):
     local_features: ClassVar[str | None] = None
     """Features that the host extracts from photographs to replace pixels: "sift" or "orb"."""
     binary: ClassVar[bool] = False
-    """Whether its features take only two values, as their visual words then do too."""
+    """Whether its features, and so their visual words, take only two values."""
     encoded_size: ClassVar[tuple[int, int] | None] = None
     """Height and width of the byte array of `local_features`; None if it takes pixels."""
     side_paths: ClassVar[int] = 1
@@ -115,7 +115,7 @@ class Backbone(Part, abc.ABC):
     """Names, or name patterns, of the parameters that are meant to be trained.
 
     They are those of adapters, named as in `init`, such as "blocks.*.adapter" or "lora". A run that
-    trains none of them is refused unless it asks for that (`--trainable head,-adapters`)."""
+    trains none of them must ask for that (`--trainable head,-adapters`)."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:
@@ -128,8 +128,8 @@ class Backbone(Part, abc.ABC):
         """Return the features of normalised images, and the parameters.
 
         Args:
-            params: from `init` or `split_blocks`.
-            images: with sides that are multiples of `patch_size`, in the dtype of the computation.
+            params: parameters from `init` or `split_blocks`.
+            images: images whose sides are multiples of `patch_size`, in the type to compute in.
             request: the features to return.
             remat: see `ModelConfig.remat`.
             valid: mask of the training images whose statistics the batch norms use

@@ -14,7 +14,7 @@ _DIM = _SIZE[0] * _SIZE[1]
 _GREY = (0.299, 0.587, 0.114)
 """Weights of red, green and blue, from BT.601."""
 _LEAST = 0.5
-"""Least deviation, half a grey level, so that rounding in a uniform patch isn't amplified."""
+"""Minimum deviation, half a grey level, so that rounding in a uniform patch isn't amplified."""
 
 
 @BACKBONES.register("thumbnail")

@@ -61,10 +61,10 @@ class SinkhornConfig:
     iterations: PositiveInt = 3
     """Number of iterations; with a tolerance, at most this number."""
     tolerance: PositiveFloat | None = None
-    """Largest error of a step at which iterations stop. For plain steps it is the relative marginal
-    error before the last step. float32 may never get below 1e-5."""
+    """Iterations stop when a step's error (`Step.error`) is at most this; for "sinkhorn" it is, to
+    first order, the relative marginal error before the step. float32 may never get below 1e-5."""
     throw: bool = False
-    """Whether to raise if the tolerance is not met; else the result says so."""
+    """Whether to raise if the tolerance is not met; otherwise the result reports it."""
     domain: Literal["scaling", "log"] = "scaling"
     """Domain of the sums. Scaling computes exponentials once; problems whose scores are too far
     apart for it are solved again in the log domain."""

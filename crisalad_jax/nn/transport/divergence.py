@@ -25,7 +25,7 @@ def sinkhorn_divergence(
 ) -> Float[Array, "*batch"]:
     """Compute the Sinkhorn divergence of two sets of tokens (Feydy et al., AISTATS 2019).
 
-    It is OT(x, y) - (OT(x, x) + OT(y, y)) / 2, where OT is the least <plan, cost> + epsilon *
+    It is OT(x, y) - (OT(x, x) + OT(y, y)) / 2, where OT is the minimum of <plan, cost> + epsilon *
     KL(plan | product of the masses) for squared Euclidean costs |x - y|^2. It is 0 for equal sets,
     never negative at convergence, and nears the squared Wasserstein distance as epsilon falls.
 
@@ -45,7 +45,7 @@ def sinkhorn_divergence(
         The divergence of each pair, in float32 at least.
 
     Raises:
-        InputError: the tokens differ in width or batch; or as `solve`.
+        InputError: the tokens differ in width or batch; or what `solve` raises.
 
     Example:
         >>> x = jnp.eye(3)

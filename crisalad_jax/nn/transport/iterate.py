@@ -142,7 +142,7 @@ def iterate(
 
         def unfinished(at: _Progress) -> Bool[Array, ""]:
             active = (at.error > tolerance) & (at.iterations < config.iterations)
-            # Out of range, the scaling domain stops at once: the log domain solves again.
+            # Out of range, the scaling domain stops early: the log domain solves again.
             return active.any() & (not isinstance(problem, ScalingProblem) or problem.in_range)
 
         progress = jax.lax.while_loop(unfinished, advance, progress)

@@ -55,7 +55,7 @@ class PartialDustbin(Dustbin):
         require_field(self, "room", 1 <= self.room < math.inf, "at least 1")
 
     def init(self, key: PRNGKeyArray, dim: int) -> Array | None:
-        """Start at the logit of `share`; None where it is not learnt."""
+        """Start at the logit of `share`; None if it is not learnt."""
         return jnp.full((), self._logit, jnp.float32) if self.learn else None
 
     @property

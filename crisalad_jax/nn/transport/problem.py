@@ -103,7 +103,7 @@ class Problem:
 
     @property
     def column_tau(self) -> float | Array:
-        """The same for the columns."""
+        """Factor of the columns' half step; see `row_tau`."""
         return 1.0 if self.taus[1] is None else self.taus[1]
 
     @property
@@ -125,7 +125,7 @@ class Problem:
         """Set the potentials of rows and columns without mass.
 
         Args:
-            potentials: of all rows and columns.
+            potentials: potentials of all rows and columns.
             value: value to set; the default `EMPTY` leaves them out of every sum and plan.
         """
         pairs = zip(self.empty, potentials, strict=True)

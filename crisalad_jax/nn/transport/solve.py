@@ -218,14 +218,14 @@ def assign_with_dustbin(
             the clusters share the rest equally; "none": None.
         dustbin: a registered dustbin, or its name.
         patches: features of the patches, for dustbins that use them.
-        **options: those of `solve`, from `epsilon` on.
+        **options: arguments of `solve`, from `epsilon` on.
 
     Returns:
         The result of `solve`; rows of the plan are the patches, columns the clusters and then the
         dustbin.
 
     Raises:
-        InputError: as `solve`; or the dustbin's mass is the number of patches minus that of
+        InputError: what `solve` raises; the dustbin's mass is the number of patches minus that of
             clusters and is not positive; the parameters do not have the dustbin's shape; or the
             dustbin has capacities and the step does not.
 

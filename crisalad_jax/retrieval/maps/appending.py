@@ -39,7 +39,7 @@ from crisalad_jax.utils.shapes import Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 MOST_CHANGED = 10**6
-"""Most images that one change may remove or move, which its JSON record has room for."""
+"""Maximum images that one change may remove or move: its JSON record has room for them."""
 
 
 class AppendableMap(Map):
@@ -98,7 +98,7 @@ class AppendableMap(Map):
 
         Args:
             verb: the reason. "replace" also removes images with the names of those that are added.
-            removed: numbers of the images to remove.
+            removed: indices of the images to remove.
             moved: new positions by image name, as `fitted_anew` returns them.
             added: new images.
 
@@ -175,7 +175,7 @@ class AppendableMap(Map):
 
         Args:
             part: the images.
-            gone: numbers of images that are removed, whose names may be used again.
+            gone: indices of removed images, whose names may be used again.
             taken: names that may not be used, in addition to those in the map.
 
         Raises:
@@ -214,9 +214,9 @@ def open_for_appending(
 ) -> Iterator[AppendableMap]:
     """Open the map with this metadata for appending, or create it with these components.
 
-    One process at a time may append; others may search meanwhile. A map that a kill left without
-    images is created again; one that an exception leaves without images is removed. Descriptors
-    without a record are removed with a warning.
+    One process at a time may append, while others search. A map that a kill left without images is
+    created again; one that an exception leaves without images is removed. Descriptors without a
+    record are removed with a warning.
 
     Raises:
         InputError: another process is appending, the folder holds a different map or one that has

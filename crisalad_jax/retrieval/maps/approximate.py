@@ -58,7 +58,7 @@ class Approximate(NamedTuple):
 
     kind: str
     ask: Callable[[Queries, int, int, Removed], Neighbours]
-    """Finds k candidates among `count` descriptors; numbers are -1 where there are fewer."""
+    """Finds k candidates among `count` descriptors; missing ones are -1."""
     store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""

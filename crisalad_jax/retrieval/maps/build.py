@@ -133,14 +133,13 @@ def index(
     The same call resumes after a kill.
 
     Args:
-        model: parameters and configuration, as `load` returns them, or a `Runtime`. Images are
-            resized and computed as the configuration says or, for an existing map, as its images
-            were.
+        model: a model from `load`, or a `Runtime`. The image size and types of an existing map take
+            precedence.
         images: the folder, searched with its subfolders; the map names images by their paths in it.
             Or another source of images (docs/how-to/image-sources.md).
         out: the map's folder.
         weights: the file that the parameters come from, which queries load by default.
-        fps: frames per second to take from a video or log, which `images` must then be; None is 1.
+        fps: frames per second, if `images` is a video or log; None is 1.
         topic: the image topic of a robot log; None takes the only one.
         position_topic: the topic of positions in a log; see `open_source`.
         positions: where images were taken, or a table or track of positions (`read_track`). None
@@ -150,8 +149,7 @@ def index(
         every_metres: minimum distance from the last selected image of the same folder or video;
             nearer images are left out, those without a position are not. None takes all.
         novelty: maximum cosine similarity to the last selected image of the same folder or video;
-            more similar images are left out, so that a robot that stands still does not fill its
-            map. None takes all.
+            more similar images are left out, as from a robot that stands still. None takes all.
         store: "files", or "milvus:URI". None is the existing map's, or "files" for a new map.
         dtype: type of the stored descriptors; "bits" stores their signs (`pack_bits`), which are
             searched by Hamming distance. None is the existing map's, or "float32" for a new map.
@@ -160,7 +158,7 @@ def index(
         search: the approximate search to build from the map's descriptors, or to extend by new
             ones, see `Map.build_search`; "exact" removes one. None leaves an existing one
             unchanged, which is not used once the map has grown.
-        again: whether to add images, too, that were removed from the map (`remove_images`).
+        again: whether to add removed images again (`remove_images`).
         reading: how images are read.
         cluster: the Ray cluster that describes the images, as in `extract`; None is this process.
 

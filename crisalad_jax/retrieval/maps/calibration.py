@@ -25,12 +25,12 @@ class Calibration:
     precision: float
     """The precision that was asked for, as a fraction."""
     answered: int
-    """Number of queries that were answered, of which `right` correctly."""
+    """Number of queries that were answered, `right` of them correctly."""
     right: int
     queries: int
     """Number of all queries of the set."""
     unknown: int
-    """Number of queries without a positive, of which `unknown_answered` were answered."""
+    """Number of queries without a positive, `unknown_answered` of which were answered."""
     unknown_answered: int
     database: int
     """Number of images that the queries were compared with."""

@@ -171,7 +171,7 @@ def replace_images(
     fps: float | None = None,
     reading: Reading = Reading(),
 ) -> MapChange:
-    """Re-describe the images of a map whose files have changed, all in one change.
+    """Re-describe the images of a map whose files have changed, in a single change.
 
     A file has changed if its size differs, or if it was written after the image was described. The
     images keep their positions, and become the last ones of the map.
@@ -188,8 +188,8 @@ def replace_images(
         What was replaced; `unmatched` are images that the map does not have.
 
     Raises:
-        InputError: another model; no image with a name in the map; an image that cannot be read, or
-            none that can; or what `open_for_appending` raises.
+        InputError: another model; no image whose name is in the map; an image that cannot be read,
+            or none that can; or what `open_for_appending` raises.
 
     Example:
         >>> import cv2, jax
@@ -257,7 +257,7 @@ def move_images(
 ) -> MapChange:
     """Give images of a map new positions, such as poses after SLAM.
 
-    Positions are converted to the map's axes and zone. They may have others if no other image of
+    Positions are converted to the map's axes and zone. Other axes are allowed if no other image of
     the map has a position.
 
     Args:
@@ -308,8 +308,8 @@ def merge_maps(
 ) -> MapChange:
     """Merge maps of the same model and settings into a map, which is created if it is missing.
 
-    A new map gets the images that are left in the others, without those that were removed. Images
-    keep their folders and days.
+    A new map gets the images of the others except removed ones. Images keep their folders and
+    dates.
 
     Args:
         folder: the map's folder.

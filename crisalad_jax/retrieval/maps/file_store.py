@@ -28,7 +28,7 @@ from crisalad_jax.utils.shapes import Float, Int64
 _BLOCK = 2**23
 """Largest number of elements in a block of descriptors, and in its products with some queries."""
 _MAPPED = 8192
-"""Most files that stay mapped; Linux allows a process 65,530 mappings. Each takes a file
+"""Maximum files that stay mapped; Linux allows a process 65,530 mappings. Each takes a file
 descriptor, of which these take at most a sixteenth."""
 
 

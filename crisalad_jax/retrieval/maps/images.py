@@ -81,7 +81,7 @@ class _Column:
         return self._room[: self._size]
 
     def extend(self, rows: Any) -> None:
-        """Append rows; a thread that reads meanwhile sees only complete ones."""
+        """Append rows; concurrent readers see only complete ones."""
         size = self._size + len(rows)
         if size > len(self._room):
             room = np.empty((size + size // 8, *self._room.shape[1:]), self._room.dtype)
@@ -265,7 +265,7 @@ class Images(Sequence[MapImage]):
         """Return the images without those in some rows, and with others moved.
 
         Raises:
-            ValueError, TypeError, OverflowError: rows beyond the last, or as `extend`.
+            ValueError, TypeError, OverflowError: rows beyond the last, or as in `extend`.
         """
         rows = [*removed, *moved]
         if not all(isinstance(row, int) and 0 <= row < self.rows for row in rows):

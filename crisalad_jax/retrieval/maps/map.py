@@ -104,13 +104,13 @@ class Map:
         self.changed = ""
         """When images were last removed, replaced or merged into it; empty for never."""
         self.axes: tuple[str, str] | None = None
-        """Axes of the positions, see `positions.AXES`; None where no image has a position."""
+        """Axes of the positions, see `positions.AXES`; None if no image has a position."""
         self.zone: Zone | None = None
-        """UTM zone of all positions in metres east and north; None where it is unknown."""
+        """UTM zone of all positions in metres east and north; None if unknown."""
         self.calibration: Calibration | None = None
-        """Result of `calibrate`; None if there is none, or the map is open for appending."""
+        """Result of `calibrate`; None without one, or if the map is open for appending."""
         self.components = read_components(folder, metadata)
-        """The components that shorten descriptors, and those of queries; None is none."""
+        """Components that shorten descriptors and those of queries, if any."""
         self._calibrated = False
         self._approximate: Approximate | None = None
         self._left_out = Where(), self.images, 0, Removed()
@@ -226,7 +226,7 @@ class Map:
         """Return the map as it is now: this one or, if it has changed, a new one in its place.
 
         Raises:
-            InputError: as `open`.
+            InputError: what `open` raises.
         """
         if not self._segments.has_more or not self.exists:
             return self
@@ -358,8 +358,8 @@ class Map:
             quiet: whether to hide the progress bar.
 
         Returns:
-            The recall of the exact 10 nearest other images of 100 of its images; None for an exact
-            search.
+            The recall of the 10 nearest images, measured on 100 images of the map; None for an
+            exact search.
 
         Raises:
             InputError: an unknown kind, one that Milvus lacks, or a map of bits.
@@ -430,7 +430,7 @@ class Map:
             queries: as `search` takes them.
 
         Raises:
-            InputError: as `search`.
+            InputError: what `search` raises.
         """
         queries = self._rows("queries", queries)
         queries = sign_vectors(queries) if self.metadata.is_bits else queries
@@ -443,7 +443,7 @@ class Map:
         return convert(rows, name, self.metadata.descriptor_length)
 
     def positions_of(self, names: Iterable[str]) -> Positions | None:
-        """Return the positions of some images; None where none of them has one."""
+        """Return the positions of some images; None if none of them has one."""
         images = map(self.image, names)
         of = {image.name: image.position for image in images if image and image.position}
         return Positions(self.axes, of, self.zone) if self.axes and of else None
@@ -534,7 +534,7 @@ class Map:
 
         Args:
             weights: as in `load_model`, which takes the result as `engine`.
-            groupings: the groupings that queries will be described in.
+            groupings: groupings of the queries.
 
         Raises:
             InputError: there is no such file, or no installed engine reads an exported folder.
@@ -556,7 +556,7 @@ class Map:
         Args:
             weights: the file, or an exported folder; None is the recorded path.
             engine: "jax", "onnxruntime" or "openvino".
-            groupings: the groupings that queries will be described in.
+            groupings: groupings of the queries.
             verify: whether to compare exported files with their checksums.
 
         Returns:
@@ -590,7 +590,7 @@ class Map:
         Args:
             model: the model; None uses the last one, or loads it. The map's image size and types
                 replace those of its configuration.
-            groupings: the groupings that queries will be described in.
+            groupings: groupings of the queries.
 
         Raises:
             InputError: another model, or what `describer_of` raises.

@@ -19,7 +19,7 @@ from crisalad_jax.retrieval.maps.where import ALWAYS, Where
 from crisalad_jax.utils.shapes import Int64
 
 _RANGES = 16
-"""Most ranges in a filter; Milvus 2.3 takes 0.1 s to parse 16, and 2 s to parse 100."""
+"""Maximum ranges in a filter; Milvus 2.3 takes 0.1 s to parse 16, and 2 s to parse 100."""
 _NOWHERE = sys.float_info.max
 """Value of an unknown position or time; Milvus before 2.5 has no null."""
 

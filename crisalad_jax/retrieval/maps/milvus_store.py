@@ -76,7 +76,7 @@ KINDS = {
 """How Milvus searches: by comparing all, in memory; by a graph, in memory; by codes of a bit and a
 byte per dimension, in memory; by a graph on disk. HNSW has the parameters of maps in files."""
 _FEW, _GRAPH_BYTES = 50_000, 2**34
-"""Most descriptors that are compared one by one, and largest size of those in a graph."""
+"""Maximum descriptors that are compared one by one, and maximum size of those in a graph."""
 
 
 def choose_kind(count: int, length: int, version: tuple[int, ...]) -> str:

@@ -78,7 +78,7 @@ def image_pairs(
     fps: float | None = None,
     reading: Reading = Reading(),
 ) -> ImagePairs:
-    """Choose pairs of images to match: all that at least one of the rules below gives.
+    """Choose pairs of images to match, by at least one of the rules below.
 
     Pairs are among the images of a map, for reconstruction, or between other images and those of
     the map, to localise them. An image is never paired with itself.
@@ -90,13 +90,13 @@ def image_pairs(
         model: that model; None loads it from its recorded path (`Map.load_model`).
         k: pair each image with its k most similar ones; 0 turns this rule off.
         min_similarity: minimum similarity of these.
-        min_gap: minimum time in seconds between these, from the times in their names: loops. Times
-            in two videos, or by two clocks, are far enough apart.
+        min_gap: minimum time in seconds between these, from the times in their names (loop
+            closures). Times in two videos, or by two clocks, are far enough apart.
         overlap: pair each image of the map with this many next ones of its folder or video.
         within: pair images of the map that were taken at most this many metres apart.
         root: folder that names are relative to; None is that of the images or, if there are
             several, the one that contains them all.
-        fps: frames per second to take if `images` is a video; None is 1.
+        fps: frames per second, if `images` is a video; None is 1.
         reading: how `images` are read.
 
     Returns:

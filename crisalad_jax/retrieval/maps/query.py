@@ -58,7 +58,7 @@ class Answers(NamedTuple):
     images: Sequence[MapImage]
     """All images of the map, by number."""
     axes: tuple[str, str] | None
-    """Axes of a position's two numbers; None where no image has a position."""
+    """Axes of a position's two numbers; None if no image has a position."""
     unreadable: Sequence[pathlib.Path] = ()
     """Image files that could not be read, which have no answers."""
     min_similarity: float | None = None
@@ -69,7 +69,7 @@ class Answers(NamedTuple):
     """Similarity of the map's most similar image, which a filter may not have ranked first; None
     without a filter, as it is the first answer's."""
     zone: Zone | None = None
-    """UTM zone of all positions; None where it is unknown."""
+    """UTM zone of all positions; None if unknown."""
     root: pathlib.Path | None = None
     """Folder that names of queries are relative to: that of their source or, if there are several,
     the one that contains them all; None if names are full paths."""
@@ -116,7 +116,7 @@ class Answers(NamedTuple):
             yield query, [Answer(rank, s, self.images[i], *more) for rank, (i, s, *more) in ranked]
 
     def position(self, image: MapImage) -> dict[str, float] | None:
-        """Return where an image was taken, by the names of the axes; None where unknown."""
+        """Return where an image was taken, by the names of the axes; None if unknown."""
         return position_fields(image, self.axes)
 
 
@@ -145,14 +145,14 @@ def query(
             (docs/how-to/image-sources.md), or a list of these.
         model: the model that made the map; None loads it from its recorded path (`Map.load_model`).
         k: number of answers per query.
-        fps: frames per second to take from a video or log, which `images` must then be; None is 1.
+        fps: frames per second, if `images` is a video or log; None is 1.
         topic: the image topic of a robot log; None takes the only one.
         window: number of frames that are described together: each with those just before it in its
             source, as a moving camera sees them. Files listed one after the other are one source. 1
             describes each independently, like a map's images.
         exact: whether to search exactly even if the map has an approximate search.
         min_similarity: a query is of an unknown place if no image is this similar to it; see
-            `Answers.known`. None is the map's calibration, or any without one; -1 is any.
+            `Answers.known`. None is the map's calibration or, without one, -1: it accepts all.
         sequence: a filter over the map's images in order, for queries that are consecutive frames
             of one camera; None answers every query independently.
         where: which images of the map to search, such as "folder=monday, added>=2026-05-01"
@@ -353,7 +353,7 @@ def _runs(sources: Sequence[Sequence[pathlib.Path]]) -> list[list[pathlib.Path]]
 
 
 def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, float] | None:
-    """Return where an image was taken, by the names of the axes; None where unknown."""
+    """Return where an image was taken, by the names of the axes; None if unknown."""
     if image.position is None or axes is None:
         return None
     return dict(zip(axes, image.position, strict=True))

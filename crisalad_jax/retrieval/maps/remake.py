@@ -117,8 +117,8 @@ def remake_map(
     """Rebuild a map by describing its images with another model.
 
     The new map replaces the old one in a single step when it is complete, so a killed call leaves
-    one or the other. Positions, folders, days and the kind of search are preserved. The calibration
-    and the record of removed images are not. A running service continues with the old map.
+    one of the two. The new one has the same positions, folders, dates and kind of search, but no
+    calibration or record of removed images. A running service continues with the old map.
 
     Args:
         folder: the map's folder.

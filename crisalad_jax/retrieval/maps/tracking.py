@@ -23,7 +23,7 @@ SequenceSearch = BayesFilter | SeqSlam
 _NUMBERS = 2**25
 """Similarities computed at a time: 128 MiB."""
 _GAP = 1e9
-"""Seconds from one video of a map to the next: farther than any camera moves."""
+"""Seconds from one video of a map to the next: more than any camera moves."""
 
 _Spot = tuple[str, tuple[float, ...]]
 """When an image was taken, as a clock and its seconds; or where, as a zone or "" and metres."""

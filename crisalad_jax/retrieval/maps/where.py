@@ -53,15 +53,15 @@ class Where:
     def parse(cls, text: str) -> Self:
         """Parse conditions separated by commas.
 
-        A day means all of it, a time its second: `added<=2026-05-01` includes what was added on
-        that day. Times without a zone are UTC.
+        A date is the whole day, a time the whole second: `added<=2026-05-01` includes what was
+        added on that day. Times without a zone are UTC.
 
         Args:
             text: such as "folder=monday, added>=2026-05-01, time<2026-05-01T12:00,
                 box=11.5,48.1,11.6,48.2", any of which may be omitted; times may be given twice.
 
         Raises:
-            InputError: another key, no or a second value, or one that is not a time or a box.
+            InputError: another key, a missing or second value, or one that is not a time or a box.
         """
         found: dict[str, Any] = {}
         for part in re.split(r",(?=\s*\w+\s*[<>=])", text):

@@ -287,12 +287,12 @@ def make_app(
         token: the token that requests must send; None needs none, and accepts only this machine.
         appends: whether the map is open for appending.
         map_images: folder of the map's images; None is the original one.
-        k: number of answers to a picture, unless the request gives one.
+        k: default number of answers to a picture.
         max_bytes: maximum size of a request body.
         max_pixels: maximum pixels of a picture in a request.
         most_waiting: maximum number of requests with a picture at once; more should retry later.
         tiles: what the page draws behind the map's places.
-        rerank: how to verify the best answers; None does not.
+        rerank: how to verify the best answers; None for no verification.
 
     Returns:
         An ASGI application.

@@ -77,10 +77,10 @@ def serve_map(
         weights: the model that made it; None is the file that was used then.
         engine: "jax", "onnxruntime" or "openvino"; or "auto", the one that `Map.fastest_engine`
             chooses.
-        host: name or address to listen on. Any but this machine's own needs a token.
+        host: name or address to listen on. Any other than this machine's needs a token.
         port: port to listen on; 0 picks a free one.
-        token: token that requests must send as `Authorization: Bearer ...`; None needs none.
-        k: number of answers to a picture, unless the request gives one.
+        token: token that requests must send as `Authorization: Bearer ...`; None for no token.
+        k: default number of answers to a picture.
         append: whether requests may add images to the map; no other process can do so then.
         map_images: folder of the map's pictures; None is the original one.
         max_bytes: maximum size of a request body.
@@ -89,7 +89,7 @@ def serve_map(
         tiles: address of street map tiles, which browsers draw behind the map's places:
             https://tile.openstreetmap.org/{z}/{x}/{y}.png. None draws none.
         tiles_attribution: text to show with them; None is what OpenStreetMap requires for its own.
-        rerank: how to verify the best answers by local features; None does not.
+        rerank: how to verify the best answers by local features; None for no verification.
         verify: whether to compare the map's descriptors with their checksums.
         quiet: whether to hide the progress bar.
         ready: called with the service's address and the engine once it answers.

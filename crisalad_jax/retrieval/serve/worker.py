@@ -138,7 +138,7 @@ class MapWorker:
         return self.places.shorten(described)[: len(images)]
 
     def _append(self, jobs: "Sequence[_Job]") -> None:
-        """Append images at once, or one by one if that fails, so that only a bad one fails."""
+        """Append images together, or one by one if that fails, so that only a bad one fails."""
         if not jobs:
             return
         first = len(self.places)

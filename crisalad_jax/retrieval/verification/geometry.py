@@ -57,7 +57,7 @@ def rotation_only(
 
     Args:
         first: directions of points from the first camera.
-        second: from the second.
+        second: the same from the second.
         distance: maximum distance of a point after rotation, which nine in ten must meet.
     """
     if len(first) < LEAST:
@@ -75,7 +75,7 @@ def relative_pose(first: Points, second: Points, distance: float) -> Pose | None
 
     Args:
         first: directions of points from the first camera.
-        second: from the second.
+        second: the same from the second.
         distance: maximum distance from an epipolar line.
     """
     if len(first) < LEAST:
@@ -145,7 +145,7 @@ def pose_on_map(
     """Place a camera on a map, from an answer and the vector to another; all are level.
 
     Args:
-        pose: from the camera to the answer's, in metres.
+        pose: pose from the camera to the answer's, in metres.
         other: vector to the other answer's camera, in the answer camera's axes, of any length.
         here: the answer's position in metres east and north.
         there: the other's.

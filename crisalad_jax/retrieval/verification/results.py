@@ -59,6 +59,6 @@ class MapPose(NamedTuple):
     """The pose of a query's camera on the map, from two answers with positions."""
 
     position: tuple[float, float]
-    """In the map's axes."""
+    """Position in the map's axes."""
     heading: float
     """View direction in degrees clockwise from north (the second axis: y, or latitude)."""

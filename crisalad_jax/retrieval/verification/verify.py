@@ -62,17 +62,17 @@ class Verify:
     matcher: str | os.PathLike[str] | None = None
     """ONNX file of a matcher, see `OnnxMatcher`; None is SIFT."""
     intrinsics: Intrinsics | None = None
-    """Of the camera of the queries, for rotations and directions; None gives only inliers."""
+    """Intrinsics of the queries' camera, for rotations and directions; None gives only inliers."""
     map_intrinsics: Intrinsics | None = None
-    """Of the camera of the map's images; None is that of the queries."""
+    """Intrinsics of the map's camera; None is `intrinsics`."""
     map_images: str | os.PathLike[str] | None = None
     """Folder of the map's images; None is the original one."""
     map_depth: str | os.PathLike[str] | None = None
     """Folder of depth for the map's images: 16-bit PNGs in millimetres under the images' names,
     0 where unknown. Answers with depth have a translation in metres."""
     min_inliers: int | None = None
-    """A query whose best answer has fewer is of an unknown place; None is what `calibrate`
-    measured, or no limit without that."""
+    """Minimum inliers of the best answer: with fewer the place is unknown. None is the map's
+    calibration, if any."""
 
     def __post_init__(self) -> None:
         """Check the numbers, and that the folders exist."""
@@ -170,7 +170,7 @@ class Verifier:
         Args:
             checks: from `check`.
             names: as `check` takes them.
-            positions: of the answers, in metres east and north; None where unknown.
+            positions: positions of the answers, in metres east and north; None if unknown.
             size: height and width of the query.
 
         Returns:

@@ -68,11 +68,11 @@ class LossBatch:
 
 @brief
 class LossValue(NamedTuple):
-    """A loss, and what is logged with it."""
+    """A loss and its logged values."""
 
     loss: Float[Array, ""]
     accuracy: Float[Array, ""] | None = None
-    """For classification."""
+    """Accuracy, if the loss classifies."""
     numbers: Mapping[str, Any] | None = None
     """Other scalars by name, such as a learnt temperature; each step logs them as `loss.NAME`."""
 
@@ -97,7 +97,7 @@ class Loss(Part, abc.ABC):
     """Whether the loss ranks all images, so that no miner may choose pairs."""
 
     of_tuples: ClassVar[bool] = False
-    """Whether the loss takes only mined tuples, where an image is in a single pair."""
+    """Whether the loss takes only mined tuples, whose pairs all contain the query."""
     learning_rate = 1e-2  # without a type, so that a subclass can make it a field
     """Learning rate of the loss's own parameters, which have their own Adam optimiser."""
 
@@ -114,8 +114,8 @@ class Loss(Part, abc.ABC):
         """Return the loss's own trainable parameters, a pytree of arrays; by default None.
 
         Args:
-            key: draws the parameters.
-            classes: number of classes, 0 for a loss of pairs.
+            key: random key.
+            classes: number of classes; 0 for a loss of pairs.
             dim: width of a descriptor.
         """
         return None

@@ -47,7 +47,7 @@ class LossConfig:
 
 
 class LossResult(NamedTuple):
-    """The loss and what is logged with it."""
+    """The loss and its logged values."""
 
     loss: Float[Array, ""]
     easy_anchor_fraction: Float[Array, ""]
@@ -78,16 +78,16 @@ def metric_loss(
     Args:
         descriptors: unit vectors; their inner products are the similarities.
         labels: the place, or class, of each image.
-        config: which loss and miner, and their constants.
-        valid: images that take part; None means all. The others are neither anchors nor pairs.
+        config: the loss, its miner and their constants.
+        valid: images that take part; None means all. The others are in no pairs.
         params: the loss's own trainable parameters (`Loss.init`).
-        classes: number of classes, if `params` have a vector for each, and padding.
+        classes: number of classes, if `params` have a vector for each, then padding.
         pairs: the pairs to choose from, such as `tuple_pairs`; None means `all_pairs`.
         tokens: local tokens or features of each image, for a loss that compares them.
         targets: a teacher's unit descriptors of the images, for a loss that compares them.
 
     Returns:
-        The loss and what is logged with it.
+        The loss and its logged values.
 
     Raises:
         InputError: a loss returns something other than a number, or its parameters, local features,

@@ -62,9 +62,9 @@ def recipe(
 
     Args:
         preset: the size of the model (`PRESETS`).
-        name: what to reproduce (`RECIPES`), or RECIPE+PART: a recipe with a registered part, as
+        name: name of the recipe (`RECIPES`), or RECIPE+PART: a recipe with a registered part, as
             NAME or KIND:NAME, in place of its own. PART by itself means crisalad+PART. None is the
-            paper's recipe, except for `tiny`, which trains from scratch.
+            paper's recipe or, for preset `tiny`, `scratch`.
         model: the model of the weights to start from, in place of the preset's and the recipe's. It
             is trained and validated at its own image size. If the recipe trains adapters and the
             model has none, only its head trains.

@@ -320,7 +320,7 @@ def megaloc(model: ModelConfig, preset: str) -> TrainConfig:
     MegaScenes, ScanNet, and San Francisco XL twice (EigenPlaces' lateral and frontal classes), as
     `--data gsv=DIR msls=DIR megascenes=DIR scannet=DIR lateral=DIR frontal=DIR`, or some of them.
     The paper chooses quadruplets of MegaScenes and ScanNet by overlapping views; here they are
-    places of a table. The optimiser, what trains and the epochs are SALAD's.
+    places of a table. The optimiser, the trainable parameters and the epochs are SALAD's.
     """
     whole = model_of(
         *(model, preset, _vit(model), "salad"),
