@@ -33,7 +33,7 @@ class Data(TableFlags, QuietFlag):
     to: Annotated[pathlib.Path | None, NEW_FOLDER] = None
     """With fetch: new folder for the set, which `crisalad evaluate --data` then reads."""
     set: str | None = None
-    """With check: name of the set that the folder should be; by default any."""
+    """With check: name of the expected set; by default what the folder is named after, or any."""
     read: bool = True
     """With check: decode all images; --no-read only counts them."""
 

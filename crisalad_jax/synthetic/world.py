@@ -1,4 +1,4 @@
-"""A world to train on: streets, corridors and country, in the layouts of real data sets."""
+"""A world to train on: streets, corridors, rooms and more, in the layouts of real data sets."""
 
 import dataclasses
 import os
