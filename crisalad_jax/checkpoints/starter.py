@@ -14,7 +14,7 @@ from crisalad_jax.utils.files import real_path
 NAME = "starter"
 """Name of the small model, for `--weights` and `load`."""
 FILE = pathlib.Path(__file__).with_name(f"{NAME}.safetensors")
-FILES = {NAME: FILE, "hog": FILE.with_stem("hog"), "thumbnail": FILE.with_stem("thumbnail")}
+FILES = {name: FILE.with_stem(name) for name in (NAME, "starter-1", "hog", "thumbnail")}
 """The files of all models in this package by their names."""
 BEST = "megaloc"
 """The published model with the best recall, which a warning names."""

@@ -39,7 +39,7 @@ def run(arguments: Models) -> dict[str, Any]:
         f"{starter.NAME}: the small model in this package, which extract, index and evaluate take "
         "by default"
     )
-    for name in ("hog", "thumbnail"):
+    for name in ("starter-1", "hog", "thumbnail"):
         echo(f"{name}: {_NOTES[name]}, by its name too")
     echo("crisalad models NAME prints all of one: its images, paper, file and address")
     return {"cache": str(user_cache()), "models": [_facts(model) for model in models]}
@@ -53,6 +53,7 @@ def _facts(model: Published) -> dict[str, Any]:
 
 _NOTES = {
     starter.NAME: f"trained only on rendered images (docs/{starter.NAME}.md)",
+    "starter-1": "the first version of starter, half as large",
     "hog": "a baseline that learns nothing: histograms of oriented gradients",
     "thumbnail": "a baseline that learns nothing: SeqSLAM's small grey images",
 }

@@ -68,8 +68,8 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     vlad-buff, selavpr (preset l14), selavprpp, salad-cm (of two sets); over ResNet boq-resnet50,
     conv-ap, cosplace, mixvpr; over VGG netvlad, patch-netvlad. In part as published:
     eigenplaces-turns, netvlad-gsv, cosplace-vit, eigenplaces-vit; sage and megaloc (of several
-    sets). From random weights: scratch, the default of tiny. starter: the last run of the model in
-    this package, whose --weights are its first run's (docs/starter.md). RECIPE+PART is a recipe
+    sets). From random weights: scratch, the default of tiny. starter: the second run of the model
+    in this package, whose --weights are its first run's (docs/starter.md). RECIPE+PART is a recipe
     with another registered part, such as crisalad+gem."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""

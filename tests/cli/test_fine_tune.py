@@ -51,7 +51,7 @@ def test_flags_come_before_the_file():
 
 
 def test_a_configuration_comes_before_the_file():
-    # The model's first run was at 96 x 128, and its last one at 144 x 192 (docs/starter.md).
+    # The model's first run was at 96 x 128, and its second one at 144 x 192 (docs/starter.md).
     config = _settings("--config", pathlib.Path(__file__).parents[2] / "docs/starter/config.json")
     assert config.model.image_size == (144, 192)
 

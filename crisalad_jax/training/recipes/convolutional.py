@@ -87,12 +87,12 @@ def boq_resnet50(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("starter")
 def starter(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of `starter`'s last run, on 24,000 places (`render --scenes 6000`).
+    """Make the recipe of `starter`'s second run, on 24,000 places (`render --scenes 6000`).
 
     It started from the weights of an earlier run on smaller images; see docs/starter.md.
     """
     whole = model_of(
-        *(model, preset, ResNetConfig(layers=18, stages=3, width=32), "conv-ap"),
+        *(model, preset, ResNetConfig(layers=18, stages=3, width=48), "conv-ap"),
         image_size=(144, 192),
         head={"channels": 64, "side": 6},
         normalisation="local-contrast",
@@ -101,7 +101,9 @@ def starter(model: ModelConfig, preset: str) -> TrainConfig:
     return dataclasses.replace(
         config,
         optimiser=dataclasses.replace(config.optimiser, learning_rate=7e-4),
-        augmentation=CameraAugmentConfig(flip=0.5, gamma=0.3, illumination=0.3),
-        epochs=4,
+        augmentation=CameraAugmentConfig(
+            crop=0.15, rotation=5.0, flip=0.5, gamma=0.3, illumination=0.3
+        ),
+        epochs=3,
         validate_every=1,
     )
