@@ -10,7 +10,7 @@ out="$(realpath -m -- "${1:-starter}")"
 # A set of photographs chooses the best epoch, or places of the world that were not trained on.
 val="$(realpath -m -- "${2:-$out/world/test}")"
 cd "$(dirname "$0")/.."
-source scripts/environment.sh "[train,report]"
+source scripts/environment.sh "[all]"
 [ -f "$out/world/set.json" ] || crisalad render --out "$out/world" --scenes 6000 --image-size 144 192
 train() { crisalad train --data "$out/world/train" --val "$val" "$@"; }
 train --config docs/starter/first.json --out "$out/first"
