@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import pathlib
 
+import jax.numpy as jnp
 import numpy as np
 
 from crisalad_jax.checkpoints import starter
@@ -44,8 +45,8 @@ def whitened(model: Model, descriptors: np.ndarray) -> Model:
     turn = vectors * np.sqrt(values.mean() / values)  # the mean keeps weights in half's range
     layer = model.params.aggregator.channel_pool
     assert layer.bias is not None
-    layer = Linear(*(np.float32(np.asarray(each) @ turn) for each in (layer.weight, layer.bias)))
-    params = dataclasses.replace(model.params, aggregator=ConvAp(layer))
+    weight, bias = (jnp.asarray(np.asarray(x) @ turn, "float32") for x in (layer.weight, layer.bias))
+    params = dataclasses.replace(model.params, aggregator=ConvAp(Linear(weight, bias)))
     return Model(params, model.config)
 
 
