@@ -43,9 +43,9 @@ def whitened(model: Model, descriptors: np.ndarray) -> Model:
     rows = rows.transpose(0, 2, 1).reshape(-1, channels)
     values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
     turn = vectors * np.sqrt(values.mean() / values)  # the mean keeps weights in half's range
-    layer = model.params.aggregator.channel_pool
-    assert layer.bias is not None
-    weight, bias = (jnp.asarray(np.asarray(x) @ turn, "float32") for x in (layer.weight, layer.bias))
+    old = model.params.aggregator.channel_pool
+    assert old.bias is not None
+    weight, bias = (jnp.asarray(np.asarray(x) @ turn, "float32") for x in (old.weight, old.bias))
     params = dataclasses.replace(model.params, aggregator=ConvAp(Linear(weight, bias)))
     return Model(params, model.config)
 
