@@ -348,7 +348,7 @@ def test_a_mirror_that_is_no_address(model, server, monkeypatch):
 def test_a_file_without_an_address_is_put_there_by_hand(model, monkeypatch, tmp_path):
     register(model, monkeypatch, url=None, note="one of a folder")
     path = tmp_path / "cache" / "models" / "tiny-model" / FILE
-    error = fails("tiny-model", "found no address of its own .*one of a folder")
+    error = fails("tiny-model", "found no separate address .*one of a folder")
     assert str(path) in error
     path.parent.mkdir(parents=True)
     path.write_bytes(DATA[:-1])

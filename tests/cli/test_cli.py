@@ -60,7 +60,9 @@ def runs(capfd: Capture, *arguments: object) -> tuple[str, str]:
     out, err = capfd.readouterr()
     assert code == 0, err
     lines = err.splitlines(keepends=True)
-    return out, "".join(line for line in lines if ": a map describes each image alone" not in line)
+    return out, "".join(
+        line for line in lines if ": a map describes images independently" not in line
+    )
 
 
 def succeeds(capfd: Capture, *arguments: object) -> str:

@@ -343,7 +343,7 @@ def test_a_map_stays_where_it_cannot_be_made_anew(placed, tmp_path, monkeypatch)
     fails(f"{path.name}: found {len(whole) - 1} bytes, expected the image of {len(whole)}")
     path.write_bytes(whole)
     (placed / "added").mkdir()
-    fails("found added beside the map")
+    fails("found added in the folder")
     (placed / "added").rmdir()
     for call, why in ((None, "no renameat2"), (lambda *_: -1, "")):
         monkeypatch.setattr(files, "_renameat2", lambda call=call: call)

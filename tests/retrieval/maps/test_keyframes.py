@@ -108,7 +108,7 @@ def names(folder: pathlib.Path) -> list[str]:
         return [image.name for image in found.images]
 
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*a map describes each image alone")
+pytestmark = pytest.mark.filterwarnings("ignore:.*a map describes images independently")
 
 
 @pytest.fixture
