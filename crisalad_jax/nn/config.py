@@ -192,7 +192,7 @@ class ModelConfig:
             not self.aggregator.fixed_grid or tuple(image_size) == tuple(self.input_size),
             f"image size: found {found}, expected {' x '.join(map(str, self.input_size))}: "
             f"aggregator {self.aggregator.part_name} has parameters for every patch, and was made "
-            "for images of this size alone",
+            "for images of this size only",
         )
         self.aggregator.check_grid(self.backbone.grid(image_size), self.backbone.patch_size)
 
