@@ -70,6 +70,7 @@ def test_positions_are_of_the_flag_the_table_names_or_exif(shared, images, tmp_p
     assert positions(tmp_path / "table")["new.jpg"] is None
 
 
+@pytest.mark.slow  # five commands, for one error
 def test_a_rate_without_a_video_is_refused(shared, images, town_map, tmp_path, capfd, weights):
     words = ("--fps: found 2 without a video among the images, expected both",)
     out = ("--out", tmp_path / "out.npy")

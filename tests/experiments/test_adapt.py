@@ -231,6 +231,7 @@ def test_the_map_stays_where_nothing_is_gained_or_others_lose(
     assert (folder / "map.json").read_bytes() == before
 
 
+@pytest.mark.slow  # trains for one number; the others train, too
 def test_the_recall_before_is_that_of_the_maps_model(folder, tmp_path) -> None:
     """And a run that goes on ends as it did."""
     config = dataclasses.replace(

@@ -86,6 +86,7 @@ def test_targets_follow_their_images(shared, teacher, monkeypatch, tmp_path) -> 
         np.testing.assert_allclose(given, alone, atol=1e-5)  # unit vectors, float32
 
 
+@pytest.mark.slow  # runs of `train` resume the same way
 def test_a_resumed_run_has_the_same_bits(shared, teacher, tmp_path) -> None:
     class Stop(Callback):
         def on_step(self, values):

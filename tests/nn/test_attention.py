@@ -242,6 +242,7 @@ def test_what_a_tpus_kernel_does_not_take_is_computed_all_the_same(
     np.testing.assert_allclose(found, expected, atol=tolerance)
 
 
+@pytest.mark.slow  # the next ones are of single parts
 def test_an_accelerators_products_are_the_cpus() -> None:
     """In float32 a GPU has no fused attention; the order of the axes is another."""
     params, x = make()

@@ -87,6 +87,7 @@ def test_a_model_is_the_one_that_a_trace_draws() -> None:
         np.testing.assert_allclose(leaf, traced[name], atol=1e-7, err_msg=name)
 
 
+@pytest.mark.slow  # compiles whole models
 def test_a_model_is_drawn_by_a_handful_of_programs() -> None:
     compiled: list[str] = []
     handler = logging.Handler()

@@ -309,7 +309,10 @@ def write_streets(root: pathlib.Path) -> pathlib.Path:
 @pytest.mark.parametrize(
     ("name", "places", "size", "moved"),
     [
-        ("sage", 4, (28, 42), {"aggregator", "backbone.blocks.adapter"}),
+        pytest.param(
+            *("sage", 4, (28, 42), {"aggregator", "backbone.blocks.adapter"}),
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             *("salad-cm", 4, (70, 70), {"aggregator", "backbone.norm"}), marks=pytest.mark.slow
         ),

@@ -366,6 +366,7 @@ def test_a_step_whose_loss_or_gradient_is_not_finite_keeps_the_state(
         np.testing.assert_array_equal(leaf, before[name])
 
 
+@pytest.mark.slow  # whole runs are compared bit for bit
 def test_same_key_same_bits_and_dropout_changes_with_the_step() -> None:
     config = dataclasses.replace(STEP, model=CONFIG)
     start = init_crisalad(jax.random.key(0), CONFIG)

@@ -155,6 +155,7 @@ print(count, len(spread.sharding.device_set), len(found.local.sharding.device_se
 """
 
 
+@pytest.mark.slow  # the next one spreads images too
 def test_images_are_spread_and_parameters_shared(tmp_path: pathlib.Path) -> None:
     """Six images, on as many devices as have the same number of them; one copy of a parameter."""
     told = {"JAX_NUM_CPU_DEVICES": "4", "PYTHONPATH": os.getcwd()}

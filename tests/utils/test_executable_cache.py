@@ -143,6 +143,7 @@ def test_only_the_latest_are_kept(folder, monkeypatch):
     assert len(programs(folder)) == 2
 
 
+@pytest.mark.slow  # four commands
 def test_the_command_line_keeps_programs_unless_a_plugin_is_loaded(shared, tmp_path):
     """As a process: `crisalad.main` within another one must not."""
     plugin = tmp_path / "plugin.py"

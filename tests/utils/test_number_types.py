@@ -97,6 +97,7 @@ def test_so_are_those_and_the_descriptors_of_a_plug_in() -> None:
     in_both_modes(lambda: describe(params, IMAGES, config))
 
 
+@pytest.mark.slow  # the next ones are quicker
 def test_descriptors_and_gradients_are_the_same_within_a_program_of_the_users() -> None:
     how = dataclasses.replace(MODEL.preprocessing, normalisation="local-contrast")
     config = dataclasses.replace(MODEL, preprocessing=how)

@@ -118,6 +118,7 @@ sys.stdout.write(text(CPU, HALF, gradient=True))
 """
 
 
+@pytest.mark.slow  # starts another process
 def test_programs_for_several_platforms_in_one_process() -> None:
     """Each has its own attention, and the CPU's is the one of a process that lowers no other."""
     for chosen in (GPU, CPU, TPU, CPU):

@@ -89,6 +89,7 @@ def test_from_nothing_rates_are_in_the_papers_proportion():
     assert {row.trainable for row in rows.values()} == {"all"}
 
 
+@pytest.mark.slow  # the costs are tested by themselves
 @pytest.mark.usefixtures("quick")
 def test_ablate(flags, capfd, tmp_path, monkeypatch):
     """The row of the whole model is trained as `compare` trains CriSALAD."""

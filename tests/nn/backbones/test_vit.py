@@ -182,7 +182,7 @@ REQUESTS = {
     "class attention": FeatureSpec(class_attention=True),
     "inserted tokens": FeatureSpec(insertion=1, inserted=INSERTED),
 }
-QUICK, SLOW = {"two levels"}, pytest.mark.slow
+SLOW = pytest.mark.slow
 KINDS = {
     "depthwise": (),
     **dict.fromkeys(("multi-resolution", "serial-parallel", "side", "none"), SLOW),
@@ -204,7 +204,7 @@ def fresh(config: VisionTransformer) -> ViT:
 @pytest.mark.parametrize(
     ("config", "name"),
     [
-        *(pytest.param(HALF, name, marks=() if name in QUICK else SLOW) for name in REQUESTS),
+        *(pytest.param(HALF, name, marks=SLOW) for name in REQUESTS),
         *(
             pytest.param(dataclasses.replace(HALF, adapter=kind), "the last tokens", marks=marks)
             for kind, marks in KINDS.items()
