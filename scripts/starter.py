@@ -1,6 +1,6 @@
 """Make the model in the package of a run's weights: whiten its channels, and store it in half.
 
-    python scripts/starter.py RUN/best.safetensors WORLD/train
+    python scripts/starter.py RUN/last.safetensors WORLD/train
 
 It writes crisalad_jax/checkpoints/starter.safetensors, and parity/goldens/starter.npz: what the
 model says of two pictures, for other machines to compare. Commit both.
@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from crisalad_jax.checkpoints import starter
-from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.aggregators.conv_ap import ConvAp, ConvApConfig
@@ -62,12 +61,12 @@ def main() -> None:
     descriptors = describe_files(model, [files[index] for index in sorted(drawn)])
     save_weights(starter.FILE, whitened(model, np.asarray(descriptors)), half=True)
     images = [render(7, View(), (60, 80), scenery) for scenery in ("street", "corridor")]
-    params, config = load(starter.FILE)
+    params, config = load_weights(starter.FILE)
     prepared = np.stack([prepare_image(image, config) for image in images])
     descriptors = np.asarray(describe(params, prepared, config))
     with atomic_path(GOLDEN) as path:
         np.savez_compressed(path, images=np.stack(images), descriptors=descriptors)
-    print(f"{starter.FILE}, and {GOLDEN}: {' x '.join(map(str, descriptors.shape))} numbers")
+    print(f"{starter.FILE}, and {GOLDEN}: {' x '.join(map(str, descriptors.shape))} dimensions")
 
 
 if __name__ == "__main__":

@@ -335,13 +335,13 @@ def _write_onnx(
         programs = _halves(model, how)
     else:
         programs = {DESCRIBE: _whole_program(model, how)}
-    form, beside = engines.FORMATS[how.format], not how.weights_inside
+    form, external = engines.FORMATS[how.format], not how.weights_inside
     files: dict[str, Any] = {}
     for name, program in programs.items():
         path = folder / f"{name}.onnx"
         words = f"{', '.join(program.inputs)} to {program.output}; {GROUPINGS[how.grouping]}"
         with number_types([model.config]), lowering_for(STRAIGHT):
-            products = write_onnx(path, *program, words=words, beside=beside)
+            products = write_onnx(path, *program, words=words, external=external)
         if calibration is not None:
             from crisalad_jax.checkpoints.onnx_format.quantise import quantise
 
@@ -352,7 +352,7 @@ def _write_onnx(
             for suffix in engines.FORMATS["onnx"].suffixes:
                 path.with_name(name + suffix).unlink()
         file, data = (folder / f"{name}{suffix}" for suffix in form.suffixes)
-        files[name] = {"program": _file(file), "weights": _file(data) if beside else None}
+        files[name] = {"program": _file(file), "weights": _file(data) if external else None}
     difference = _difference(folder, list(files), model, how)
     if calibration is None and not difference <= TOLERANCE:
         raise engines.NotExportableError(

@@ -80,14 +80,19 @@ def claims() -> Study:
     return Study(Table(header, found, caption, 3), found)
 
 
+def measured() -> dict[str, Any]:
+    """What `bench_claims.py` measured; nothing where it was not run."""
+    path = FOLDER / "speed.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
 def models() -> Study:
     """What a model costs, and the command that repeats its row."""
-    path = FOLDER / "speed.json"
-    measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    speeds = measured.get("times_megaloc", {})
+    speed = measured()
+    speeds = speed.get("times_megaloc", {})
     header = ("model", "reproduces", "licence", "numbers", "million parameters", "speed")
     found = [(row["title"], command(row), *facts(row, speeds)) for row in rows()]
-    device = f" on one {measured['device']}" if measured else ""
+    device = f" on one {speed['device']}" if speed else ""
     caption = (
         f"Speed: images described a second{device}, as a multiple of MegaLoc's, at its own image "
         "size, in bfloat16. The second column follows `crisalad evaluate --data SET`."
@@ -97,7 +102,7 @@ def models() -> Study:
 
 def best() -> str:
     """The rows with the highest mean of Pitts30k and MSLS, for independent images, and speeds."""
-    speeds = json.loads((FOLDER / "speed.json").read_text(encoding="utf-8"))["images_per_second"]
+    speeds = measured()["images_per_second"]
     alone = [
         row
         for row in rows()

@@ -220,7 +220,7 @@ def test_a_conversion_computes_what_jax_does(name: str, tmp_path: pathlib.Path):
     (batch,) = export.symbolic_shape("batch")
     shape = jax.ShapeDtypeStruct((batch, ROWS, COLUMNS), jnp.float32)
     path = tmp_path / "program.onnx"
-    write_onnx(path, run, {}, {"x": shape}, "y", words="a test", beside=False)
+    write_onnx(path, run, {}, {"x": shape}, "y", words="a test", external=False)
     onnx.checker.check_model(onnx.load(path), full_check=True)
     programs = [load_program("onnxruntime", path), load_program("openvino", path)]
     for count in (1, 5):

@@ -204,7 +204,7 @@ def test_several_batches_share_a_step_and_its_learning_rate(epoch: int) -> None:
         ({"kind": "optax.no"}, r"found 'optax\.no', expected a function of optax that takes a le"),
         ({"kind": "optax.contrib"}, "found 'optax.contrib', expected a function of optax"),
         ({"kind": "optax.contrib.jax.jit"}, "expected a function of optax that takes a learning"),
-        ({"kind": "optax.lbfgs"}, "optimiser optax.lbfgs: cannot step with only a gradient"),
+        ({"kind": "optax.lbfgs"}, "optax.lbfgs: cannot step with only a gradient and a schedule"),
         ({"warmup_steps": 3, "warmup_epochs": 2}, "warmup_epochs: found 2, expected 0 with"),
         ({"accumulate": 0}, r"OptimiserConfig\.accumulate: found 0, expected a whole number of"),
         (

@@ -28,7 +28,7 @@ def write_onnx(
     output: str,
     *,
     words: str,
-    beside: bool,
+    external: bool,
 ) -> list[str]:
     """Write a function of weights and other arrays as an ONNX program.
 
@@ -42,7 +42,7 @@ def write_onnx(
             which may be symbolic.
         output: name of the output.
         words: description to store in the file.
-        beside: whether large weights go to a separate file, `path` with .data appended.
+        external: whether large weights go to a separate file, `path` with .data appended.
 
     Returns:
         Names of the nodes that multiply by weights.
@@ -70,13 +70,13 @@ def write_onnx(
     for name, array in graph.constants.items():
         # A transposed view is written in the order of its axes.
         tensor = numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name)
-        if beside and array.nbytes >= _PAGE:
+        if external and array.nbytes >= _PAGE:
             external_data_helper.set_external_data(tensor, f"{path.name}.data", offset=end)
             end += math.ceil(array.nbytes / _PAGE) * _PAGE
         model.graph.initializer.append(tensor)
     products = _products(model, graph.constants, [np.asarray(each) for each in weights.values()])
     with wrap_os_errors(path):
-        if beside:  # even if all arrays are small
+        if external:  # even if all arrays are small
             path.with_name(f"{path.name}.data").touch()
         onnx.save_model(model, path)
     return products

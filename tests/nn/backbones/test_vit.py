@@ -96,7 +96,11 @@ def test_side_adapters_take_the_sum_of_both_paths() -> None:
 @pytest.mark.parametrize(
     ("config", "request_", "words"),
     [
-        (SIDE, FeatureSpec((1,)), "levels or a facet and adapters on a side path, expected only"),
+        (
+            SIDE,
+            FeatureSpec((1,)),
+            "levels or a facet and adapters on a side path, expected only one of these",
+        ),
         (SIDE, FeatureSpec(class_attention=True), "token's attention and adapters on a side path"),
         (
             SIDE,
