@@ -37,9 +37,6 @@ class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     jobs: int | None = None
     """Parallel runs, each a Ray task (extra ray) with its share of the devices; without --cluster
     on this machine. By default 1; on a cluster one per GPU, or per node if there is none."""
-    page: pathlib.Path | None = None
-    """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
-    of NAME -->, where NAME is the name of the folder --out."""
 
 
 def names_of(text: str) -> tuple[str, ...]:
@@ -82,7 +79,7 @@ def run_comparison(
     summary = compare(
         config,
         flags.out,
-        **pick(flags, "page", "jobs", "cluster", "quiet"),
+        **pick(flags, "jobs", "cluster", "quiet"),
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
     )
     show_tables(*tables_of(summary).values(), latex=flags.latex)

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import pathlib
-import re
 import stat
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -364,21 +363,6 @@ def npy_header(dtype: np.dtype, shape: tuple[int, ...]) -> bytes:
     values = {"descr": dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     write_array_header_1_0(file, values)
     return file.getvalue()
-
-
-def split_markers(page: pathlib.Path, name: str) -> tuple[str, str]:
-    """Split a page around the place `name`, which two comments enclose.
-
-    Raises:
-        InputError: there is no such page, or no place of this name in it.
-    """
-    text = read_text(page, "a page with a place for the table").replace("\r\n", "\n")
-    start, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    place = rf"(.*?{re.escape(start)}\n).*?({re.escape(end)}.*)"
-    found = re.fullmatch(place, text, re.DOTALL)
-    if found is None:
-        raise InputError(f"{page}: found no {start} ... {end}, expected both comments")
-    return found[1], found[2]
 
 
 @contextlib.contextmanager

@@ -1,14 +1,13 @@
 #!/usr/bin/env bash
-# Sets up what is missing, then times this package beside torch and other engines, on a machine with nothing else to do.
+# Sets up what is missing, then times this package, torch and other engines, on a machine with nothing else to do.
 #
-#     bench_all.sh               all tables and pictures of docs/performance.md, its studies, docs/training.md
-#                                and docs/search.md: hours
-#     bench_all.sh --processor   descriptors, training steps, products and answers alone, for a
-#                                processor that is not in docs/performance.md: an hour or more on two cores
-#     bench_all.sh --gpu         on a GPU that both torch and jax find, into docs/performance-gpu.md: 15 minutes, not timed yet
+#     bench_all.sh               all tables and pictures of docs/performance, docs/training and docs/search: hours
+#     bench_all.sh --processor   only descriptors, training steps, products and answers, for a
+#                                processor that is not in docs/performance: an hour or more on two cores
+#     bench_all.sh --gpu         on a GPU that both torch and jax find, into docs/performance-gpu: 15 minutes, not timed yet
 #
-# --processor and --gpu replace the tables that are there. --small after one of them tries it out in small sizes,
-# as on a CPU, and leaves the tables in a folder of its own.
+# --processor and --gpu replace the existing tables. --small after one of them tries it out in small sizes,
+# as on a CPU, and writes the tables to a temporary folder.
 # Flags that follow go to the benches of descriptors and training steps, such as
 #     --presets b14 --batches 256 --dtypes bfloat16
 set -euo pipefail
@@ -20,7 +19,7 @@ if [ "${1:-}" = --small ] && [ $mode != all ]; then small=1; shift; fi
 source scripts/environment.sh "[dev,bench]"
 bench() { python "scripts/bench/bench_$1.py" "${@:2}"; }
 if [ "$mode" = gpu ]; then
-  to=(--out docs/performance-gpu --page docs/performance-gpu.md)
+  to=(--out docs/performance-gpu)
   [ -z "$small" ] || to=(--out "$(mktemp -d)")
   describe=(--presets b14 --batches 1 64 256 --dtypes float32 bfloat16) train=(--presets b14 --batches 192 --dtypes float32 bfloat16)
   folder=(--presets b14 --images 4000 --batch 256) memory=(--preset b14 --images 192) sinkhorn=()
@@ -36,7 +35,7 @@ if [ "$mode" = gpu ]; then
   bench memory "${to[@]}" "${memory[@]}"
   exit
 fi
-to=(--page docs/performance.md --page docs/performance-studies.md)
+to=()
 if [ "$mode" = processor ]; then
   describe=(--presets tiny s14 b14 resnet50 --batches 1 8 --dtypes float32 bfloat16)
   train=(--presets tiny s14 b14 --batches 8 --dtypes float32 bfloat16) start=()
@@ -51,20 +50,19 @@ if [ "$mode" = processor ]; then
   bench locate "${to[@]}" "${start[@]}"
   exit
 fi
-bench describe "${to[@]}" "$@"
-bench published "${to[@]}"
-bench train "${to[@]}" "$@"
-bench extract "${to[@]}"
-bench start "${to[@]}"
-bench query "${to[@]}"
-bench locate "${to[@]}"
-bench scale "${to[@]}"
-bench modes "${to[@]}"
-bench profile "${to[@]}"
-to=(--page docs/training.md)
-bench index "${to[@]}"
-bench loader "${to[@]}"
-bench overlap "${to[@]}"
-bench memory "${to[@]}" --take
+bench describe "$@"
+bench published
+bench train "$@"
+bench extract
+bench start
+bench query
+bench locate
+bench scale
+bench modes
+bench profile
+bench index
+bench loader
+bench overlap
+bench memory --take
 # A million descriptors take 34 GB of the folder for temporary files.
-bench search --page docs/search.md
+bench search

@@ -1,6 +1,6 @@
 """Describe images on a Ray cluster of one-core nodes of this machine, and in one process.
 
-    python scripts/bench/bench_cluster.py [--out docs/large] [--page docs/large.md]
+    python scripts/bench/bench_cluster.py [--out docs/large]
         [--images 5000] [--nodes 2] [--rounds 3] [--weights starter]
 
 Each node is a raylet of its own, pinned to one core; the one process uses as many cores as there

@@ -1,7 +1,6 @@
 """Images described a second, beside every engine that a user would pick instead, in one run.
 
     python scripts/bench/bench_describe.py [--out docs/performance]
-        [--page docs/performance.md --page docs/performance-studies.md]
         [--presets b14 megaloc ...] [--sizes 224x224 ...] [--batches 1 8 16]
         [--dtypes float32 bfloat16] [--keep]
 

@@ -1,6 +1,6 @@
 """From a folder of photographs to a file of descriptors, beside torch and its DataLoader.
 
-    python scripts/bench/bench_extract.py [--page docs/performance-studies.md]
+    python scripts/bench/bench_extract.py
         [--presets s14 ...] [--images 2000] [--batch 16]
 
 Ours is what `crisalad extract` does: list, decode, resize, describe (independently) over the CPU's

@@ -1,6 +1,6 @@
 """Training data of the size of GSV-Cities: how long its index takes, in what memory; then an epoch.
 
-    python scripts/bench/bench_index.py [--out docs/training] [--page docs/training.md]
+    python scripts/bench/bench_index.py [--out docs/training]
         [--tree FOLDER] [--cities 23] [--places 2000] [--images 560000] [--size 64]
 
 Writes a tree in the layout of GSV-Cities: so many cities of so many places, each place a small JPEG

@@ -1,6 +1,6 @@
 """Training batches from JPEG files, beside torch's DataLoader with Pillow; no model.
 
-    python scripts/bench/bench_loader.py [--out docs/training] [--page docs/training.md]
+    python scripts/bench/bench_loader.py [--out docs/training]
         [--images 960] [--batch 192] [--rounds 5]
 
 Both read the same files in the same order, as batches of 224 x 224, each image augmented by

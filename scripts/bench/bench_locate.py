@@ -1,7 +1,7 @@
 """Latency of `Map.locate` on some cores, by JAX and by the engines that `--runtime auto` takes.
 
     python scripts/bench/bench_locate.py [--out docs/performance]
-        [--page docs/performance-studies.md] [--preset tiny s14 b14]
+        [--preset tiny s14 b14]
         [--runtime jax onnxruntime openvino] [--cores 1 2 4] [--rounds 5]
 
 Each run is a process of its own on the first N cores. It asks a map of 64 images where one camera's

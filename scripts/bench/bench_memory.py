@@ -1,6 +1,6 @@
 """Memory of a training step of the paper's size, by the compiler's analysis; and one step taken.
 
-    python scripts/bench/bench_memory.py [--out docs/training] [--page docs/training.md]
+    python scripts/bench/bench_memory.py [--out docs/training]
         [--preset b14] [--images 192] [--micro-batches 24] [--take]
 
 The paper's recipe (adapters and head train, the rest is frozen), 48 places x 4 images, compiled for

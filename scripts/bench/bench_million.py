@@ -1,6 +1,6 @@
 """A map of a million synthetic descriptors: made, indexed and asked, next to plain FAISS.
 
-    python scripts/bench/bench_million.py [--out docs/large] [--page docs/large.md]
+    python scripts/bench/bench_million.py [--out docs/large]
         [--rows 1000000] [--length 512] [--dtype float16] [--searches ivf-rabitq] [--queries 100]
         [--rounds 3] [--folder FOLDER]
 

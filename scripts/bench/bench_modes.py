@@ -1,6 +1,6 @@
 """What bfloat16 gains and loses beside float32, and why there is no int8, in one run.
 
-    python scripts/bench/bench_modes.py [--page docs/performance-studies.md]
+    python scripts/bench/bench_modes.py
         [--presets s14 b14] [--batch 8] [--run demo/run] [--city demo/city]
 
 Four tables. One product of matrices, of the size of `b14`'s widest: its rate by type and by the

@@ -1,6 +1,6 @@
 """Whether a training step waits for its images: the loader beside the step, and alone.
 
-    python scripts/bench/bench_overlap.py [--out docs/training] [--page docs/training.md]
+    python scripts/bench/bench_overlap.py [--out docs/training]
         [--presets tiny s14] [--batch 48] [--steps 12] [--rounds 3]
 
 Runs of `fit` (the paper's recipe, from random weights) on drawn photographs of 400 x 300, as

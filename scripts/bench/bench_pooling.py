@@ -1,6 +1,6 @@
 """Max pooling forward and backward, as a ResNet begins: ours, XLA's own gradient, and torch's.
 
-python scripts/bench/bench_pooling.py [--page docs/performance-studies.md]
+python scripts/bench/bench_pooling.py
 """
 
 from collections.abc import Callable

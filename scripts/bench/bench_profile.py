@@ -1,6 +1,6 @@
 """Where the time of our programs goes, by a trace of `jax.profiler`.
 
-    python scripts/bench/bench_profile.py [--page docs/performance-studies.md]
+    python scripts/bench/bench_profile.py
         [--presets tiny s14 b14] [--batch 8]
 
 Descriptors of a batch and a training step, on the devices that the command line uses. Every

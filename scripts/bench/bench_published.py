@@ -1,6 +1,6 @@
 """Images that published models describe a second, raced as in `bench_describe.py`.
 
-    python scripts/bench/bench_published.py [--page docs/performance-studies.md]
+    python scripts/bench/bench_published.py
         [--presets cosplace-resnet50 megaloc] [--batches 8] [--dtypes bfloat16]
 
 One of each family, at the size of images that it is published for.

@@ -1,6 +1,6 @@
 """From a question to its answer: `crisalad query` with each runtime, beside a script of one's own.
 
-    python scripts/bench/bench_query.py [--out docs/performance] [--page docs/performance.md]
+    python scripts/bench/bench_query.py [--out docs/performance]
         [--preset tiny b14] [--runtime jax onnxruntime openvino] [--rounds 5]
 
 Each is a program of its own that is asked where one photograph was taken, in a map of 64. What can

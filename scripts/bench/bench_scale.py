@@ -1,7 +1,7 @@
 """Measure how time and memory grow with batch, image and clusters, compared with torch.
 
     python scripts/bench/bench_scale.py [--out docs/performance]
-        [--page docs/performance-studies.md] [--preset s14] [--rounds 3]
+        [--preset s14] [--rounds 3]
 
 One of the three grows at a time; the others stay at 4 images of 224 x 224 with 64 clusters
 (clusters grow at 322 x 322, where there are patches enough for 256). Time and operations are of one

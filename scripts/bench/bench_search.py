@@ -1,7 +1,7 @@
 """Search beside FAISS: exact speed, memory as the database grows, what approximate indexes miss.
 
     python scripts/bench/bench_search.py [bench_search] [search_memory] [search_approximate]
-        [--out docs/search] [--page docs/search.md]
+        [--out docs/search]
         [--rows 100000] [--lengths 8448 512] [--queries 1000] [--rounds 3]
         [--memory-rows 100000 1000000] [--memory-length 8448] [--dtype float32] [--folder FOLDER]
         [--approximate-rows 100000] [--approximate-length 512]

@@ -1,6 +1,6 @@
 """Clients on this machine who ask `crisalad serve` at once: latency, rate, and what is lost.
 
-    python scripts/bench/bench_serve.py MAP IMAGES [--out docs/serve] [--page docs/serve.md]
+    python scripts/bench/bench_serve.py MAP IMAGES [--out docs/serve]
         [--clients 1 8 32] [--seconds 20]
 
 The service is a program of its own. Each client has a connection, and posts one of the images after

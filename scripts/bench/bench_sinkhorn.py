@@ -1,6 +1,6 @@
 """Time and memory of the transport, forward and backward, beside torch and ott-jax, in one run.
 
-    python scripts/bench/bench_sinkhorn.py [--out DIR] [--page docs/sinkhorn-studies.md] [BENCH ...]
+    python scripts/bench/bench_sinkhorn.py [--out DIR] [BENCH ...]
 
 Needs torch (the `dev` extra); contenders of ott-jax join in where it is installed. On a GPU if both
 jax and torch find one. Before anything is timed, plans and gradients are checked to be equal, to

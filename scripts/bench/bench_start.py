@@ -1,6 +1,6 @@
 """From nothing to a first descriptor in a file, beside torch: each a program of its own.
 
-    python scripts/bench/bench_start.py [--page docs/performance-studies.md]
+    python scripts/bench/bench_start.py
         [--preset b14 tiny] [--rounds 3]
 
 `crisalad extract` of one photograph, with an empty compile cache (cold) and with what the run

@@ -1,7 +1,6 @@
 """Images trained on a second, beside the same step in torch, in one run.
 
     python scripts/bench/bench_train.py [--out docs/performance]
-        [--page docs/performance.md --page docs/performance-studies.md]
         [--presets b14 ...] [--batches 8 16] [--dtypes float32 bfloat16] [--keep]
 
 The step is that of the preset's recipe: the paper's (frozen backbone; adapters and head train), and

@@ -1,6 +1,6 @@
 """Descriptors, training steps and starts beside their peers, with each supported version of JAX.
 
-    python scripts/bench/bench_versions.py [--page docs/performance-studies.md]
+    python scripts/bench/bench_versions.py
         [--python OTHER/bin/python ...] [--presets tiny s14 b14] [--rounds 3]
 
 It runs `bench_describe.py`, `bench_train.py` and `bench_start.py` by this interpreter and by each

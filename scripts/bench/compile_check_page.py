@@ -1,4 +1,4 @@
-"""Put the figures of `scripts/compile_check` into the page about accelerators.
+"""Tabulate the figures of `scripts/compile_check`.
 
     python scripts/bench/compile_check_page.py [--figures docs/accelerators] [--page PAGE.md]
 
@@ -12,8 +12,9 @@ import pathlib
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 
-from tables import Table, markdown, put
+from tables import Table, markdown
 
+from crisalad_jax.experiments.tables import write_text
 from scripts.compile_check import ProgramCheck, read_check
 from scripts.compile_check.tables import (
     COLUMNS,
@@ -54,7 +55,7 @@ def before_and_after(programs: Mapping[str, ProgramCheck]) -> Table:
         for name, what, before, goal, figure in BEFORE
         if name in programs
     ]
-    caption = "Before and after the work on accelerators, counted in the same way."
+    caption = "Counted in the same way."
     return Table(("program", "figure", "before", "goal", "now"), rows, caption, 2)
 
 
@@ -83,7 +84,7 @@ def scaling(programs: Mapping[str, ProgramCheck]) -> Table:
             )
         )
     header = ("machines", "images/s", "times", "of 8 times", "messages", "memory, GB")
-    return Table(header, rows, "Training on 192 images, by the model of time.", 1)
+    return Table(header, rows, "Training on 192 images.", 1)
 
 
 def loader(programs: Mapping[str, ProgramCheck], measured: pathlib.Path) -> Table:
@@ -102,14 +103,16 @@ def loader(programs: Mapping[str, ProgramCheck], measured: pathlib.Path) -> Tabl
         rows.append((name, f"{rounded(wanted):,}", *cores))
     header = ("machine", "images/s", *(f"cores, {size}" for size in rates))
     words = ", ".join(f"{rate:.0f} from {size}" for size, rate in rates.items())
-    caption = f"One core gives so many images a second: {words}."
+    caption = f"Images per second that one core loads: {words}."
     return Table(header, rows, caption, 1)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--figures", type=pathlib.Path, default=pathlib.Path("docs/accelerators"))
-    parser.add_argument("--page", type=pathlib.Path, default=pathlib.Path("docs/accelerators.md"))
+    parser.add_argument(
+        "--page", type=pathlib.Path, default=pathlib.Path("docs/accelerators/programs.md")
+    )
     arguments = parser.parse_args()
     there = [arguments.figures / name for name in FILES if (arguments.figures / name).exists()]
     usual, *grown = (read_check(path).programs for path in there)
@@ -120,17 +123,17 @@ def main() -> None:
     versions = read_check(arguments.figures / FILES[0]).versions
     compilers = ", ".join(f"{name} {version}" for name, version in versions.items())
     tables = {
-        "takes": figures(usual, TAKES, f"What each program takes, of one device ({compilers})."),
-        "made of": figures(usual, MADE_OF, "What it is made of."),
-        "before and after": before_and_after(by_name),
-        "scaling": scaling(by_name),
-        "grown": figures(larger, TAKES, "Training on more devices, and on more images."),
-        "loader": loader(by_name, measured),
+        "Time and memory": figures(usual, TAKES, f"Of one device ({compilers})."),
+        "Operations": figures(usual, MADE_OF, ""),
+        "Before and after": before_and_after(by_name),
+        "More devices": scaling(by_name),
+        "More devices and images": figures(larger, TAKES, "Training."),
+        "Cores for loading": loader(by_name, measured),
     }
     if len(larger) == 1:  # nothing larger than the reference was compiled
-        del tables["grown"]
-    for name, table in tables.items():
-        put(arguments.page, f"compile_check {name}", markdown(table))
+        del tables["More devices and images"]
+    sections = (f"## {title}\n\n{markdown(table)}" for title, table in tables.items())
+    write_text(arguments.page, "\n".join(["# Programs compiled for accelerators\n", *sections]))
 
 
 if __name__ == "__main__":

@@ -1,23 +1,19 @@
 """Export every kind of published model in every format, and measure what the formats change.
 
-    python scripts/bench/export_zoo.py [--models salad cricavpr] [--page docs/export.md]
+    python scripts/bench/export_zoo.py [--models salad cricavpr]
 
-Weights are random: no file of a model is needed, but for the shapes in parity/. A line of the table
-is a model, and a number is the largest difference of any number of a few descriptors from those of
-`describe`. With --page the table takes its place in the page.
+Weights are random, with the shapes of the files in parity/.
 """
 
-import argparse
 import gc
 import pathlib
 import sys
 import tempfile
-from collections.abc import Sequence
 
 import jax
 import numpy as np
 import safetensors.numpy
-from tables import put
+from tables import Study, Table, flags, leave, read
 
 from crisalad_jax.checkpoints.export import FORMATS, ExportConfig, write_export
 from crisalad_jax.nn.config import PRESETS, ModelConfig
@@ -93,26 +89,19 @@ def row(name: str) -> list[str]:
     return cells
 
 
-def table(rows: Sequence[Sequence[str]]) -> str:
-    """The table of these lines, in Markdown."""
-    formats = [f"{each}, {grouping}" for grouping in ("single", "batch") for each in FORMATS]
-    head = ["model", "images", "numbers", *formats]
-    lines = [head, ["---", "---", *["---:"] * (len(head) - 2)], *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = flags((__doc__ or "").splitlines()[0], "docs/export")
     parser.add_argument("--models", nargs="+", default=MODELS)
-    parser.add_argument("--page", type=pathlib.Path)
-    given = parser.parse_args()
+    given = read(parser, "zoo")
     rows = []
     for name in given.models:
-        rows.append(row(name))
-        print(f"| {' | '.join(rows[-1])} |", flush=True)
+        rows.append(tuple(row(name)))
+        print(*rows[-1], sep="  ", file=sys.stderr, flush=True)
         gc.collect()
-    if given.page is not None:
-        put(given.page, "zoo", table(rows))
+    formats = [f"{each}, {grouping}" for grouping in ("single", "batch") for each in FORMATS]
+    header = "model", "images", "dimensions", *formats
+    caption = "Largest difference of any dimension of a few descriptors from those of `describe`."
+    leave("zoo", Study(Table(header, rows, caption, 2), rows), given)
 
 
 if __name__ == "__main__":

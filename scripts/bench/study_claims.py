@@ -1,6 +1,6 @@
 """Tables of what is claimed and how it was measured, for `docs/claims.md` and the README.
 
-    python scripts/bench/study_claims.py [--page docs/claims.md] [claims] [models] [leakage]
+    python scripts/bench/study_claims.py [claims] [models] [leakage]
 
 claims: every row of `docs/claims/claims.toml`. models: licence, length and parameters of the same
 from the table of published models, and the speed that `bench_claims.py` measured. leakage: what
@@ -15,12 +15,13 @@ import tomllib
 from typing import Any, NamedTuple
 
 import numpy as np
-from tables import Study, Table, flags, leave, put, read_some
+from tables import Study, Table, flags, leave, read_some
 
 from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.evaluation.leakage import masked, mirrored_share, near, same_place_share
 from crisalad_jax.evaluation.protocols import PROTOCOLS
 from crisalad_jax.retrieval.grouping import Batches, batches_of
+from crisalad_jax.utils.files import atomic_path
 
 ROOT = pathlib.Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "claims"
@@ -204,8 +205,12 @@ def main() -> None:
     arguments = read_some(flags("Tabulate; see the top.", "docs/claims"), STUDIES)
     for name in arguments.studies:
         leave(name, STUDIES[name](), arguments)
-    if arguments.page is not None and "claims" in arguments.studies:
-        put(README, "best", best())
+    if "claims" in arguments.studies:
+        start, end = "<!-- best -->\n", "<!-- end of best -->"
+        before, rest = README.read_text(encoding="utf-8").split(start)
+        with atomic_path(README) as temporary:
+            after = rest.split(end)[1]
+            temporary.write_text(f"{before}{start}{best()}{end}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":

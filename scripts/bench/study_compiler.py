@@ -1,6 +1,6 @@
 """What XLA's options are worth on each supported version of JAX: which exist, help, or crash.
 
-    python scripts/bench/study_compiler.py [--page docs/performance-studies.md]
+    python scripts/bench/study_compiler.py
         [--python OTHER/bin/python ...] [--rounds 3] [--cases "describe b14 float32 8 2" ...]
 
 Each program is compiled and timed in a process of its own (`compiled_by.py`) with each library's

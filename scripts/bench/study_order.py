@@ -1,6 +1,6 @@
 """How much of a cross-image model's recall is the order of the files.
 
-    python scripts/bench/study_order.py --runs RUNS [--seeds 0 1 2] [--page docs/claims.md]
+    python scripts/bench/study_order.py --runs RUNS [--seeds 0 1 2]
 
 Small networks with CriSALAD's encoder, with SAGE's, and without one are trained on rendered places,
 as in `study_small.py`, whose runs are gone on with. They are asked on 400 other places, stations of

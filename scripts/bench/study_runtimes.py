@@ -1,20 +1,18 @@
 """Recall of one model by each runtime, in float32 and in fewer bits, on photographs.
 
     python scripts/bench/study_runtimes.py --weights FILE --data SET... --int8 PHOTOGRAPHS
-        [--page docs/export.md]
 
-Every image is described alone. "Same" counts the queries with the same first answer as JAX's. With
---page the table takes its place in the page.
+Images are described independently.
 """
 
-import argparse
 import dataclasses
 import pathlib
+import sys
 import tempfile
 from collections.abc import Iterator
 
 import numpy as np
-from tables import put
+from tables import Study, Table, flags, leave, read
 
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
@@ -68,15 +66,16 @@ def recalls(answers: np.ndarray, data: Benchmark) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = flags((__doc__ or "").splitlines()[0], "docs/export")
     parser.add_argument("--weights", type=pathlib.Path, required=True)
     parser.add_argument("--data", type=pathlib.Path, nargs="+", required=True)
     parser.add_argument("--int8", type=pathlib.Path, required=True)
-    parser.add_argument("--page", type=pathlib.Path)
-    given = parser.parse_args()
+    given = read(parser, "runtimes")
     sets = [open_benchmark(path) for path in given.data]
-    heads = [f"{data.name}: R@1 / 5 / 10 | same" for data in sets]
-    lines = [f"| runtime | {' | '.join(heads)} |", f"|{' --- |' * (1 + 2 * len(sets))}"]
+    header = ["runtime"]
+    for data in sets:
+        header += [f"{data.name}: R@1 / 5 / 10", "same"]
+    rows = []
     exact: list[np.ndarray] = []
     with tempfile.TemporaryDirectory() as folder:
         for name, model in models(given.weights, given.int8, pathlib.Path(folder)):
@@ -86,10 +85,10 @@ def main() -> None:
             for found, first, data in zip(answers, exact, sets, strict=True):
                 cells.append(" / ".join(f"{each:.1f}" for each in recalls(found, data)))
                 cells.append(f"{int((found[:, 0] == first[:, 0]).sum())} of {len(found)}")
-            lines.append(f"| {' | '.join(cells)} |")
-            print(lines[-1], flush=True)
-    if given.page is not None:
-        put(given.page, "runtimes", "\n".join(lines) + "\n")
+            rows.append(tuple(cells))
+            print(*cells, sep="  ", file=sys.stderr, flush=True)
+    caption = "Same: the queries whose first answer is the same as in float32 with JAX."
+    leave("runtimes", Study(Table(tuple(header), rows, caption), rows), given)
 
 
 if __name__ == "__main__":

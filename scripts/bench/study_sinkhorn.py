@@ -1,11 +1,10 @@
-"""What the transport's iterations do and leave undone, on random scores: tables and plots.
+"""Tabulate and plot how the transport converges, on random scores.
 
-    python scripts/bench/study_sinkhorn.py [--out DIR] [--page docs/sinkhorn-studies.md] [STUDY ...]
+    python scripts/bench/study_sinkhorn.py [--out DIR] [STUDY ...]
 
 Two kinds of scores, of a batch of images each: "iid", independent Gaussians; "lowrank", inner
 products of rank 4 plus a bias per cluster, nearer to what a network makes. Each is scaled to a
-standard deviation. Writes NAME.md, NAME.json and NAME.png per study, and with --page puts the
-tables into that page. About two minutes on two cores.
+standard deviation. About two minutes on two cores.
 """
 
 import dataclasses

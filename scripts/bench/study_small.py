@@ -1,11 +1,11 @@
 """What parts of a model and variations of the rendered world are worth: many short trainings.
 
-    python scripts/bench/study_small.py --runs RUNS [--data SET...] [--page PAGE] [STUDY...]
+    python scripts/bench/study_small.py --runs RUNS [--data SET...] [STUDY...]
 
 Studies: transport, transport_more and encoder (a small ViT with SALAD), adapters (such a ViT that
 was trained on a plainer world, frozen), world (a small ResNet with Conv-AP, from which the world
-leaves out one variation at a time) and distil (the model in the package, for a quarter of the
-pixels, taught by places' labels, by that model, or by both, in as many steps). All train on
+leaves out one variation at a time) and distil (starter-1 for a quarter of its pixels, trained on
+places' labels, on the descriptors of starter-1, or on both, in as many steps). All train on
 rendered places alone, and are asked on other rendered places and on each SET, by its folder's name.
 Runs that RUNS already holds are gone on with. A run takes two to ten minutes of two cores.
 """
@@ -201,7 +201,7 @@ def distillation() -> list[Arm]:
     arms = [Arm("labels", config, whole)]
     for label, weight in (("teacher", 0.0), ("teacher and labels", 1.0)):
         loss = LossConfig(kind=DistilConfig(labels=weight))
-        arms.append(Arm(label, dataclasses.replace(config, loss=loss), whole, teacher="starter"))
+        arms.append(Arm(label, dataclasses.replace(config, loss=loss), whole, teacher="starter-1"))
     return arms
 
 

@@ -1,18 +1,15 @@
-"""What the model in the package recalls, beside HOG and the same network untrained.
+"""Recall of the model in the package, of HOG, and of the same network with random weights.
 
     python scripts/bench/study_starter.py --data SET... [--weights FILE] [--others NAME=FILE...]
-        [--page docs/starter.md]
 
-Every image is described alone. An interval is the bootstrap's, of 95 %. Others are models trained
-in another way. With --page the table takes its place in the page.
+Images are described independently. Intervals are the bootstrap's, of 95 %.
 """
 
-import argparse
 import pathlib
 from collections.abc import Iterator, Mapping
 
 import jax
-from tables import put
+from tables import Study, Table, flags, leave, read
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import load
@@ -38,24 +35,22 @@ def by_model(
     return result.recalls, result.intervals[1]
 
 
-def rows(models: Models, sets: list[Benchmark]) -> Iterator[str]:
-    """The lines of the table."""
+def rows(models: Models, sets: list[Benchmark]) -> Iterator[tuple[str, ...]]:
+    """Yield a row for each set and model."""
     for data in sets:
         for name, model in models.items():
             found, interval = by_model(*model, data)
             first, *others = (f"{100 * found[k]:.1f}" for k in KS)
             low, high = (f"{100 * each:.1f}" for each in (interval.low, interval.high))
-            cells = (data.name, str(len(data.queries)), name, f"{first} ({low} to {high})", *others)
-            yield f"| {' | '.join(cells)} |"
+            yield data.name, name, str(len(data.queries)), f"{first} ({low} to {high})", *others
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = flags((__doc__ or "").splitlines()[0], "docs/starter")
     parser.add_argument("--data", type=pathlib.Path, nargs="+", required=True)
     parser.add_argument("--weights", type=pathlib.Path, default=starter.FILE)
     parser.add_argument("--others", nargs="*", default=[], help="NAME=FILE of weights")
-    parser.add_argument("--page", type=pathlib.Path)
-    given = parser.parse_args()
+    given = read(parser, "recalls")
     own, config = load_weights(given.weights)
     untrained = init_crisalad(jax.random.key(0), config)
     models: Models = {"HOG": load("hog"), "untrained": (untrained, config)}
@@ -63,13 +58,9 @@ def main() -> None:
         models[name] = load_weights(file)
     models["**starter**"] = own, config
     sets = [open_benchmark(path) for path in given.data]
-    heads = ["set", "queries", "descriptor", *(f"R@{k}" for k in KS)]
-    lines = [f"| {' | '.join(heads)} |", "| --- | ---: | --- | ---: | ---: | ---: |"]
-    for line in rows(models, sets):
-        lines.append(line)
-        print(line, flush=True)
-    if given.page is not None:
-        put(given.page, "recalls", "\n".join(lines) + "\n")
+    heads = "set", "descriptor", "queries", *(f"R@{k}" for k in KS)
+    found = list(rows(models, sets))
+    leave("recalls", Study(Table(heads, found, "Recall in percent.", 2), found), given)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Recall by Sinkhorn variant: short trainings of `tiny` on the synthetic city, several seeds.
 
     python scripts/bench/study_transport.py --runs RUNS [--data DIR]
-        [--page docs/sinkhorn-studies.md]
 
 With --data, some of the variants also on photographs: trained on DIR/sped_train (GSV-Cities
 layout), tested on DIR/sped_val (@UTM layout). Runs that RUNS already holds are gone on with. Writes

@@ -1,10 +1,9 @@
-"""What a study leaves: a table in Markdown, its numbers, a picture; and the page that shows it."""
+"""The output of a study: a page with its table, its values as JSON, and a picture."""
 
 import argparse
-import contextlib
 import json
 import pathlib
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
@@ -13,10 +12,66 @@ from matplotlib.figure import Figure
 from crisalad_jax.experiments import tables
 from crisalad_jax.experiments.report import style
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_target, split_markers
+from crisalad_jax.utils.files import atomic_path, check_target
 
 INK, GREY = style.INK, style.GREY
 COLOURS = (*style.COLOURS, INK)
+TITLES = {
+    "claims": "Claimed recalls and their sources",
+    "models": "Published models in this package",
+    "leakage": "How groupings leak places",
+    "order": "Recall by the order of the images",
+    "runtimes": "Recall by runtime",
+    "zoo": "Published models exported",
+    "bench_million": "A million images",
+    "bench_cluster": "Describing on a cluster",
+    "sequence": "Recall of the sequence filter",
+    "bench_describe_costs": "What describing costs",
+    "bench_train_costs": "What a training step costs",
+    "bench_locate": "Answers per second of a robot",
+    "bench_scale": "Speed by the number of devices",
+    "bench_published": "Speed of published models",
+    "bench_published_costs": "What published models cost",
+    "bench_extract": "From a folder of images to descriptors",
+    "bench_start": "From a new process to the first descriptor",
+    "bench_bfloat16": "Error of bfloat16",
+    "bench_recall": "Recall in bfloat16",
+    "bench_products": "Precision of matrix products",
+    "bench_gradients": "Gradients in bfloat16",
+    "bench_versions": "Speed by version of jax",
+    "study_compiler": "Options of the compiler",
+    "bench_profile": "Where the time goes",
+    "bench_pooling": "Speed of pooling",
+    "bench_describe": "Speed of describing",
+    "bench_train": "Speed of training",
+    "bench_query": "Time of a query",
+    "bench_search": "Speed of searches",
+    "search_memory": "Memory of searches",
+    "search_approximate": "Approximate searches",
+    "bench_serve": "Throughput of the service",
+    "dustbin": "What a dustbin receives",
+    "error": "Error of a plan by iterations",
+    "mass": "Mass by iterations",
+    "gradient": "Error of a gradient",
+    "acceleration": "Accelerated steps",
+    "sharpness": "Sharpness of plans",
+    "precision": "Error by precision",
+    "recall": "Recall by transport",
+    "bench_fixed": "Speed of a fixed number of iterations",
+    "bench_converged": "Speed to convergence",
+    "transport": "Transports in small trainings",
+    "transport_more": "Further transports in small trainings",
+    "adapters": "Adapters in small trainings",
+    "encoder": "The cross-image encoder in small trainings",
+    "world": "Variations of the rendered world",
+    "distil": "Distillation in small trainings",
+    "recalls": "Recall of the model in the package",
+    "bench_memory": "Memory of a training step",
+    "bench_loader": "Speed of the loader",
+    "bench_overlap": "Loading during training",
+    "bench_index": "Reading an index of GSV-Cities",
+}
+"""The title of each study's page, by the name of its files."""
 
 
 class Table(NamedTuple):
@@ -43,50 +98,30 @@ def number(value: float) -> str:
 
 def markdown(table: Table) -> str:
     rows = [list(map(tables.Cell, cells)) for cells in table.rows]
-    return f"{table.caption}\n\n{tables.Table(table.header, rows, table.labels).markdown()}"
+    text = tables.Table(table.header, rows, table.labels).markdown()
+    return f"{table.caption}\n\n{text}" if table.caption else text
 
 
 def files_of(name: str, out: pathlib.Path) -> list[pathlib.Path]:
-    """What a study is saved in: its table, its numbers, its picture if it has one."""
+    """Return where a study saves its page, its values, and its picture if it has one."""
     return [out / f"{name}{suffix}" for suffix in (".md", ".json", ".png")]
 
 
 def save(name: str, study: Study, out: pathlib.Path) -> None:
     """Write NAME.md, NAME.json and, with a figure, NAME.png."""
-    text, numbers, picture = files_of(name, out)
-    tables.write_text(text, markdown(study.table))
-    with atomic_path(numbers) as temporary:  # numbers for people: no reader checks them
+    page, values, picture = files_of(name, out)
+    tables.write_text(page, f"# {TITLES[name]}\n\n{markdown(study.table)}")
+    with atomic_path(values) as temporary:
         temporary.write_text(json.dumps(study.values, indent=2) + "\n", encoding="utf-8")
     if study.figure is not None:
         with atomic_path(picture) as temporary:
             study.figure.savefig(temporary, format="png", dpi=120, facecolor="white")
 
 
-def page_of(pages: Sequence[pathlib.Path], name: str) -> pathlib.Path:
-    """The first page that has the comments of this name; the last where none has."""
-    for page in pages[:-1]:
-        with contextlib.suppress(InputError):
-            split_markers(page, name)
-            return page
-    return pages[-1]
-
-
-def put(page: pathlib.Path, name: str, text: str) -> None:
-    """Put a text in the page, between its two comments of this name.
-
-    Raises:
-        InputError: the page has no such comments.
-    """
-    before, after = split_markers(page, name)
-    tables.write_text(page, before + text + after)
-
-
 def flags(description: str, out: str) -> argparse.ArgumentParser:
-    """A parser of where what a study leaves goes: folder `out` by default, and a page if asked."""
+    """Make a parser with `--out`, the folder of a study's files."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(out))
-    words = "also put what is tabled into this page; of several, into the one with a place for it"
-    parser.add_argument("--page", type=pathlib.Path, action="append", help=words)
     return parser
 
 
@@ -98,43 +133,39 @@ def count(text: str) -> int:
 
 
 def read(parser: argparse.ArgumentParser, *names: str) -> argparse.Namespace:
-    """The arguments of `flags`, once it is known that the studies of these names have a place."""
+    """Parse arguments, and check that studies of these names can be saved."""
     arguments = parser.parse_args()
-    _check_places(parser, arguments, names)
+    _check_targets(parser, arguments, names)
     return arguments
 
 
 def read_some(parser: argparse.ArgumentParser, names: Collection[str]) -> argparse.Namespace:
-    """As `read`, of those of these studies that are asked for, or of all: its `studies`."""
+    """Parse arguments with `studies`, those of `names` to run (by default all), as `read` does."""
     words = ", ".join(names)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {words}")
     arguments = parser.parse_args()
     if unknown := set(arguments.studies) - set(names):
         parser.error(f"found {', '.join(sorted(unknown))}, expected of {words}")
     arguments.studies = arguments.studies or list(names)
-    _check_places(parser, arguments, arguments.studies)
+    _check_targets(parser, arguments, arguments.studies)
     return arguments
 
 
-def _check_places(
+def _check_targets(
     parser: argparse.ArgumentParser, arguments: argparse.Namespace, names: Iterable[str]
 ) -> None:
-    """End the program in one line if a study cannot be left where the arguments say, before it."""
+    """Exit with one line if a study can't be saved in `--out`."""
     try:
         for name in names:
             for path in files_of(name, arguments.out):
                 check_target(path)
-            if arguments.page is not None:
-                split_markers(page_of(arguments.page, name), name)
     except (InputError, OSError) as error:
         parser.error(str(error))
 
 
 def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:
-    """Put a study where the arguments of `flags` say, and on the terminal."""
+    """Save a study in `--out`, and print its table."""
     save(name, study, arguments.out)
-    if arguments.page is not None:
-        put(page_of(arguments.page, name), name, markdown(study.table))
     print(markdown(study.table), flush=True)
 
 

@@ -1,9 +1,9 @@
-"""Attack everything, and put the counts into docs/reliability.md.
+"""Attack everything, and write the counts to docs/reliability/attacks.md.
 
     python -m tests.attack [--rows rows.json] [--only damage,kills]
 
 Takes an hour or so on two cores. With --rows, results of an earlier call that are not tried again
-are kept.
+are preserved.
 """
 
 import argparse
@@ -13,14 +13,14 @@ import subprocess
 import sys
 import tempfile
 
-from crisalad_jax.utils.files import atomic_path, split_markers
+from crisalad_jax.utils.files import atomic_path
 from tests.attack.world import ROOT
 
 SCRIPTS = (
     *("kills", "interruptions", "memory", "disks", "damage", "inputs"),
     *("service", "hostile", "surroundings", "clusters", "processes"),
 )
-PAGE = ROOT / "docs" / "reliability.md"
+PAGE = ROOT / "docs" / "reliability" / "attacks.md"
 
 
 def table(rows: list[dict]) -> str:
@@ -60,9 +60,8 @@ def main() -> int:
             command = [sys.executable, "-m", f"tests.attack.{script}", "--out", str(rows)]
             subprocess.run(command, cwd=ROOT, check=False)
         found = json.loads(rows.read_text(encoding="utf-8"))["rows"]
-    before, after = split_markers(PAGE, "attacks")
     with atomic_path(PAGE) as temporary:
-        temporary.write_text(f"{before}\n{table(found)}\n\n{after}", encoding="utf-8")
+        temporary.write_text(f"# All attacks\n\n{table(found)}\n", encoding="utf-8")
     return 1 if any(row["failures"] for row in found) else 0
 
 

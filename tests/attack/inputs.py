@@ -251,7 +251,7 @@ FILE_ARGUMENTS = {
     "info": "--weights model.safetensors, --map map/",
     "export": "--weights model.safetensors",
     "vocabulary": "--images pictures/, --backbone backbone.pth",
-    "compare": "--train places/, --test town/, --backbone backbone.safetensors, --page page.md",
+    "compare": "--train places/, --test town/, --backbone backbone.safetensors",
     "ablate": "--train places/",
 }
 """Arguments of each verb, with the name of the bad file; a folder is right in place of NAME/."""

@@ -24,7 +24,6 @@ import scipy.optimize
 import scipy.special
 
 from crisalad_jax.sinkhorn import STEPS, SinkhornConfig
-from crisalad_jax.utils.errors import InputError
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "sinkhorn.md"
@@ -241,15 +240,11 @@ def test_only_the_published_dustbin_is_dead(study: ModuleType) -> None:
     )
 
 
-def test_the_page_shows_the_tables_as_written(scripts: Any, study: ModuleType) -> None:
+def test_the_page_links_every_table_and_picture(study: ModuleType) -> None:
     page = STUDIES.read_text(encoding="utf-8")
-    shown = re.findall(r"<!-- (\w+) -->\n(.*?)<!-- end of \1 -->", page, re.DOTALL)
-    others = {"bench_fixed", "bench_converged", "recall"}
-    assert {name for name, _ in shown} == {*study.STUDIES, *others}
-    for name, table in shown:
-        assert table == (PAGE.parent / "sinkhorn" / f"{name}.md").read_text(encoding="utf-8")
+    for name in {*study.STUDIES, "bench_fixed", "bench_converged", "recall"}:
+        assert f"(sinkhorn/{name}.md)" in page
         assert f"(sinkhorn/{name}.png)" in page
-        assert (PAGE.parent / "sinkhorn" / f"{name}.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -259,32 +254,23 @@ def test_numbers_have_two_digits(scripts: Any, given: float, written: str) -> No
     assert scripts("tables").number(given) == written
 
 
-def test_a_table_goes_between_its_comments(scripts: Any, tmp_path: pathlib.Path) -> None:
+def test_a_study_is_a_page_and_its_values(scripts: Any, tmp_path: pathlib.Path) -> None:
     tables = scripts("tables")
-    page = tmp_path / "page.md"
-    page.write_text("above\n<!-- x -->\nold\n<!-- end of x -->\nbelow\n")
     table = tables.Table(("what", "number"), [("a", "1"), ("b", "2")], "Caption.")
-    tables.put(page, "x", tables.markdown(table))
-    expected = "Caption.\n\n| what | number |\n| --- | ---: |\n| a | 1 |\n| b | 2 |\n"
-    assert page.read_text() == f"above\n<!-- x -->\n{expected}<!-- end of x -->\nbelow\n"
-    with pytest.raises(InputError, match=r"page\.md: found no <!-- y -->"):
-        tables.put(page, "y", tables.markdown(table))
-    other = tmp_path / "other.md"
-    other.write_text("<!-- y -->\n<!-- end of y -->\n")
-    assert [tables.page_of([page, other], name) for name in "xyz"] == [page, other, other]
+    tables.save("world", tables.Study(table, {"a": 1}), tmp_path)
+    rows = "| what | number |\n| --- | ---: |\n| a | 1 |\n| b | 2 |\n"
+    expected = f"# Variations of the rendered world\n\nCaption.\n\n{rows}"
+    assert (tmp_path / "world.md").read_text() == expected
+    assert json.loads((tmp_path / "world.json").read_text()) == {"a": 1}
 
 
-def test_studies_may_follow_the_page(scripts: Any, tmp_path: pathlib.Path, monkeypatch) -> None:
+def test_studies_may_be_chosen(scripts: Any, tmp_path: pathlib.Path, monkeypatch) -> None:
     tables = scripts("tables")
-    given = ["study", "--out", str(tmp_path), "one"]
-    monkeypatch.setattr(sys, "argv", given)
-    parser = tables.flags("", "docs")
-    assert tables.read_some(parser, ["one", "two"]).studies == ["one"]
-    page = tmp_path / "page.md"
-    page.write_text("<!-- one -->\n<!-- end of one -->\n")
-    monkeypatch.setattr(sys, "argv", [*given[:3], "--page", str(page), "one"])
+    monkeypatch.setattr(sys, "argv", ["study", "--out", str(tmp_path), "one"])
     asked = tables.read_some(tables.flags("", "docs"), ["one", "two"])
-    assert (asked.studies, asked.page) == (["one"], [page])
+    assert (asked.studies, asked.out) == (["one"], tmp_path)
+    monkeypatch.setattr(sys, "argv", ["study"])
+    assert tables.read_some(tables.flags("", str(tmp_path)), ["one"]).studies == ["one"]
 
 
 def snippets() -> list[str]:

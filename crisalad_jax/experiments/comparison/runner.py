@@ -36,7 +36,7 @@ from crisalad_jax.experiments.comparison.results import (
     runs_of,
     summarise,
 )
-from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
+from crisalad_jax.experiments.comparison.tables import write_tables
 from crisalad_jax.experiments.comparison.tasks import in_tasks, in_turn, joined
 from crisalad_jax.experiments.report.gallery import first_right_ranks
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
@@ -49,7 +49,7 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.start import with_vocabulary_of
 from crisalad_jax.training.trainer import run_keys
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_no_links, real_path, split_markers, write_json
+from crisalad_jax.utils.files import check_no_links, write_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.target import target
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
@@ -64,7 +64,6 @@ def compare(
     config: ComparisonConfig,
     out: str | os.PathLike[str],
     *,
-    page: str | os.PathLike[str] | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
     say: Say = lambda line: None,
@@ -80,8 +79,6 @@ def compare(
         config: the comparison's configuration.
         out: the folder. In addition to the runs it holds table.md, table.csv, results.json and the
             page index.html.
-        page: a Markdown page that gets the tables too, between its comments <!-- NAME --> and
-            <!-- end of NAME -->, where NAME is the name of the folder.
         jobs: number of runs at once, as Ray tasks, each with its share of the devices. By
             default 1; on a cluster one per GPU, or one per node if there are no GPUs.
         cluster: Ray cluster: "local", "auto" or an address, as `cluster.connected` takes it. All
@@ -95,14 +92,10 @@ def compare(
     Raises:
         InputError: what `prepare`, `fit`, `evaluate` and `summarise` raise; the folder holds
             other files, or a run of the same name with other settings; another process is writing
-            to it; the page has no place for the tables; or there is no such cluster, or a node that
-            cannot take part.
+            to it; or there is no such cluster, or a node that cannot take part.
         Interrupted: a signal asked it to stop; the same call resumes.
     """
     out = pathlib.Path(out)
-    name = real_path(out).name
-    if page is not None:
-        split_markers(pathlib.Path(page), name)
     if jobs is not None:
         check_count("--jobs", jobs)
         jobs = min(jobs, len(config.lines) * config.seeds)
@@ -141,8 +134,6 @@ def compare(
             write_json(out / "speed.json", speed)
         summary = summarise(prepared, runs, speed)
         write_tables(summary, out)
-    if page is not None:
-        put_in_page(pathlib.Path(page), name, markdown(summary))
     return summary
 
 

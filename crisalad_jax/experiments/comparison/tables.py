@@ -21,7 +21,7 @@ from crisalad_jax.experiments.report.style import (
     new_figure,
 )
 from crisalad_jax.experiments.tables import NOTHING, Cell, Table, write_csv, write_text
-from crisalad_jax.utils.files import split_markers, write_json
+from crisalad_jax.utils.files import write_json
 
 _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"}
 
@@ -45,12 +45,6 @@ def markdown(summary: Summary) -> str:
     """Write all tables and notes as Markdown."""
     tables = [table.markdown() for table in tables_of(summary).values()]
     return "\n".join([*tables, *(f"{note}\n" for note in summary.notes)])
-
-
-def put_in_page(page: pathlib.Path, name: str, text: str) -> None:
-    """Put a text between its markers in a page; raises what `split_markers` raises."""
-    before, after = split_markers(page, name)
-    write_text(page, f"{before}\n{text}\n{after}")
 
 
 def tables_of(summary: Summary) -> dict[str, Table]:

@@ -111,13 +111,6 @@ def test_another_size_for_parameters_of_one(settings):
     assert variant.model.image_size == (56, 70)
 
 
-def test_a_page_without_a_place(flags, capfd, tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("nothing\n")
-    words = (page, "found no <!-- out --> ... <!-- end of out -->, expected both comments")
-    fails(capfd, *flags, "--out", tmp_path / "out", "--page", page, words=words)
-
-
 def test_weights_with_a_second_stage(settings, shared):
     """A line of its own: the first stage alone stands above it."""
     file = shared / "weights.safetensors"

@@ -10,7 +10,6 @@ from crisalad_jax.evaluation.difference import Difference
 from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.experiments.comparison import AdapterCost, Recall, Row, Summary, tables
 from crisalad_jax.experiments.comparison.results import Spread
-from crisalad_jax.utils.errors import InputError
 
 ONE = Recall(0.625, 0.125, Interval(0.4, 0.8), (0.75, 0.5))
 LONE = Recall(0.25, None, Interval(0.1, 0.4), (0.25,))
@@ -152,18 +151,6 @@ def test_on_a_narrow_page_what_a_row_changes_stands_below_its_name(tmp_path):
 )
 def test_table_3_in_markdown(cost, line):
     assert line in tables.markdown(SUMMARY._replace(adapters=[cost])).splitlines()
-
-
-def test_a_table_in_a_page(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- city -->\nold\n<!-- end of city -->\nafter\n")
-    for _ in range(2):
-        tables.put_in_page(page, "city", "| new |\n")
-        assert page.read_text() == (
-            "before\n<!-- city -->\n\n| new |\n\n<!-- end of city -->\nafter\n"
-        )
-    with pytest.raises(InputError, match=r"page\.md: found no <!-- town --> \.\.\. <!-- end of"):
-        tables.put_in_page(page, "town", "")
 
 
 BETTER = Difference(0.0449, Interval(0.004, 0.0861), "better")
