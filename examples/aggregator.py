@@ -1,6 +1,6 @@
-"""An aggregator with parameters: patches are averaged by an attention that is learnt.
+"""An aggregator with parameters: a learnt attention averages the patches.
 
-A frozen dataclass holds the settings, a pytree of arrays the parameters.
+A frozen dataclass holds the settings, and a pytree of arrays holds the parameters.
 
     python examples/aggregator.py
     crisalad train --plugin examples/aggregator.py --recipe crisalad+attention-pool ...
@@ -18,12 +18,12 @@ import crisalad_jax as cj
 @cj.register_aggregator("attention-pool", tiny={"heads": 2})
 @dataclasses.dataclass(frozen=True)
 class AttentionPool(cj.Aggregator):
-    """A softmax over patches for each head; the heads' means, side by side, are the descriptor."""
+    """A softmax over patches for each head; the concatenated means of all heads are the descriptor."""
 
     heads: int = 4
 
     def token_shape(self, dim):
-        """Say that there is one global token, and no local ones."""
+        """Return the shape: one global token, no local tokens."""
         return cj.TokenShape(global_dim=self.heads * dim, tokens=0, token_dim=self.heads * dim)
 
     def init(self, key, backbone, grid):
@@ -32,7 +32,7 @@ class AttentionPool(cj.Aggregator):
         return {"queries": queries}
 
     def apply(self, params, features, grid, *, key):
-        """Average the patches of a batch, or of one image, as each head sees them."""
+        """Average the patches of a batch, or of one image, with the weights of each head."""
         patches = features.patches.astype(jnp.float32)
         shares = jax.nn.softmax(patches @ params["queries"], axis=-2)
         means = jnp.einsum("...ph,...pd->...hd", shares, patches)
@@ -40,7 +40,7 @@ class AttentionPool(cj.Aggregator):
 
 
 def main():
-    """Describe two pictures of noise by an untrained model with this aggregator."""
+    """Describe two noise images with an untrained model that uses this aggregator."""
     config = cj.recipe("tiny", "crisalad+attention-pool").model
     params = cj.init_crisalad(jax.random.key(0), config)
     pictures = np.random.default_rng(0).integers(0, 256, (2, *config.image_size, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""A loss: the soft triplet loss, log(1 + exp(distance gap)), of all mined pairs.
+"""A custom loss: the soft triplet loss, log(1 + exp(distance gap)), of all mined pairs.
 
 python examples/loss.py
 crisalad train --plugin examples/loss.py --loss.kind soft-triplet ...
@@ -25,14 +25,14 @@ class SoftTriplet(cj.Loss):
         farthest = jnp.where(positives, batch.similarities, jnp.inf).min(axis=1)
         nearest = jnp.where(negatives, batch.similarities, -jnp.inf).max(axis=1)
         counted = positives.any(axis=1) & negatives.any(axis=1)
-        # Where nothing is counted the gap is a finite one, for a finite gradient.
+        # Where nothing is counted, the gap is finite, so that the gradient is finite.
         gap = jnp.where(counted, nearest, 0) - jnp.where(counted, farthest, 0)
         losses = jnp.where(counted, jax.nn.softplus(self.scale * gap), 0)
         return cj.LossValue(losses.sum() / jnp.maximum(counted.sum(), 1))
 
 
 def main():
-    """Take the loss of four descriptors of two places, and follow its gradient."""
+    """Minimise the loss of four descriptors of two places by gradient descent."""
     config = cj.LossConfig(kind="soft-triplet", miner="none")
     labels = jnp.array([0, 0, 1, 1])
     points = jax.random.normal(jax.random.key(0), (4, 3))

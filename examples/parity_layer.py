@@ -1,6 +1,6 @@
-"""One layer held against torch: the cross-image encoder's is `nn.TransformerEncoderLayer`.
+"""Compare one layer with torch: the cross-image encoder's is `nn.TransformerEncoderLayer`.
 
-Weights are copied, then outputs and all gradients compared. Torch stores a linear layer's weight
+Weights are copied, then outputs and all gradients are compared. Torch stores a linear layer's weight
 transposed. `parity/` does this for the whole model. It needs torch: `pip install torch`.
 
     python examples/parity_layer.py
@@ -17,11 +17,11 @@ NAMES = {
     "attn.qkv.bias": "self_attn.in_proj_bias",
     "attn.proj": "self_attn.out_proj",
 }
-"""By our name, torch's; all others are the same."""
+"""Torch's names by ours; all other names are the same."""
 
 
 def to_torch(tree):
-    """Return the arrays of a layer by torch's names, laid out as torch has them."""
+    """Return the arrays of a layer by torch's names, in torch's layout."""
     arrays = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         name = jax.tree_util.keystr(path, simple=True, separator=".")
@@ -32,7 +32,7 @@ def to_torch(tree):
 
 
 def main():
-    """Compare the outputs and the gradients of a sum of squares, largest difference of each."""
+    """Print the largest difference of the outputs, and of each gradient of a sum of squares."""
     config = cj.CrossImageConfig(layers=1, heads=4, feedforward=64, dropout=0.0)
     params = config.init(jax.random.key(0), 32)
     tokens = jax.random.normal(jax.random.key(1), (6, 5, 32))  # images, tokens, width

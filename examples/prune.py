@@ -1,4 +1,4 @@
-"""Search a learning rate with optuna, and stop the runs that fall behind early.
+"""Search for a learning rate with optuna, and stop runs early that fall behind.
 
     python examples/prune.py
 
@@ -15,10 +15,10 @@ TRIALS, EPOCHS = 3, 4
 
 
 class Prune(cj.Callback):
-    """Report each validation to a trial of optuna, and stop the run if it is to be pruned."""
+    """Reports each validation to an optuna trial, and stops the run if it should be pruned."""
 
     def __init__(self, trial):
-        """Take the trial."""
+        """Store the trial."""
         self.trial, self.recall = trial, 0.0
 
     def on_validation(self, numbers):
@@ -30,7 +30,7 @@ class Prune(cj.Callback):
 
 
 def main():
-    """Train a small model a few times, each with another learning rate."""
+    """Train a small model a few times with different learning rates."""
     try:
         import optuna
     except ModuleNotFoundError:

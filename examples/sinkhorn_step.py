@@ -1,6 +1,6 @@
-"""A Sinkhorn step of one's own: columns that take at most their mass, and may take less.
+"""A custom Sinkhorn step: columns take at most their mass, and may take less.
 
-Register a function, and it is a name: in Python, in a file of a configuration, or in a flag.
+A registered function can be used by name: in Python, in a configuration file, or in a flag.
 
     python examples/sinkhorn_step.py
     crisalad train --plugin examples/sinkhorn_step.py --model.aggregator.sinkhorn.step capped ...
@@ -24,7 +24,7 @@ def capped(problem, potentials):
 
 
 def main():
-    """Send eight rows of mass 1 to four columns that could take 3 each."""
+    """Send eight rows of mass 1 to four columns that can take 3 each."""
     scores = jax.random.normal(jax.random.key(0), (8, 4)) + jnp.array([2.0, 0.0, 0.0, 0.0])
     log_mu, log_nu = jnp.zeros(8), jnp.log(jnp.full(4, 3.0))
     config = cj.SinkhornConfig(step="capped", iterations=100)

@@ -1,4 +1,4 @@
-"""Search a learning rate with Ray Tune: trials at once, on a machine or a cluster.
+"""Search for a learning rate with Ray Tune: parallel trials on a machine or a cluster.
 
     python examples/sweep.py
 
@@ -15,7 +15,7 @@ RATES, EPOCHS = (1e-2, 1e-3, 1e-5), 4
 
 
 def report_to_tune():
-    """Make a callback that reports each validation to Ray Tune, which may end the trial then."""
+    """Make a callback that reports each validation to Ray Tune, which may then end the trial."""
     from ray import tune
 
     class Report(cj.Callback):
@@ -26,7 +26,7 @@ def report_to_tune():
 
 
 def train(trial, city, runs):
-    """Train a small model: a trial. Where one is begun again, it resumes its run."""
+    """Train a small model as one trial; a restarted trial resumes its run."""
     from ray import tune
 
     config = cj.recipe("tiny")
@@ -47,13 +47,13 @@ def train(trial, city, runs):
         cj.read_places(city / "train"),
         runs / tune.get_context().get_trial_id(),
         validation=cj.open_benchmark(city / "test"),
-        callbacks=["csv", report_to_tune()],  # Tune may end the trial in the second
+        callbacks=["csv", report_to_tune()],  # Tune may end the trial in the second callback
         quiet=True,
     )
 
 
 def main(folder=None):
-    """Try the learning rates, two trials at once; return Tune's results."""
+    """Try the learning rates, two trials at a time, and return Tune's results."""
     try:
         from ray import tune
     except ImportError:
@@ -73,7 +73,7 @@ def main(folder=None):
             max_concurrent_trials=2,
             scheduler=tune.schedulers.ASHAScheduler("epoch", max_t=EPOCHS, grace_period=1),
         ),
-        # A trial whose worker is lost is begun again.
+        # A trial whose worker is lost is restarted.
         run_config=tune.RunConfig(
             storage_path=str(folder / "tune"),
             failure_config=tune.FailureConfig(max_failures=2),

@@ -1,8 +1,8 @@
-"""A training loop of one's own, with any optimiser of optax, on pictures made in memory.
+"""A custom training loop with any optax optimiser, on pictures made in memory.
 
     python examples/training_loop.py
 
-`cj.fit` is the whole loop, with batches, validation, early stop and files that resume.
+`cj.fit` is the complete loop, with batches, validation, early stopping and resumable files.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ PLACES, VIEWS, STEPS = 8, 2, 12
 
 
 def main():
-    """Train all of a small model for a few steps on one batch."""
+    """Train the whole of a small model for a few steps on one batch."""
     config = cj.recipe("tiny")
     model = dataclasses.replace(
         config.model,

@@ -1,6 +1,6 @@
 """`python -m parity`: compare every layer and whole training runs with the torch reference.
 
-Exit codes: 0 all within their tolerances, 1 a row missed, 2 bad arguments.
+Exit codes: 0 if all rows are within tolerance, 1 if a row missed, 2 for bad arguments.
 """
 
 import dataclasses
@@ -24,17 +24,17 @@ from parity.report import terminal_table, verdict, write_report
 
 @dataclasses.dataclass(frozen=True)
 class Parity:
-    """Compare crisalad_jax with its torch reference: a table of errors, tolerances and verdicts."""
+    """Compare crisalad_jax with its torch reference, in a table of errors and tolerances."""
 
     precision: str = ",".join(PRECISIONS)
-    """Precisions, separated by commas."""
+    """Comma-separated precisions."""
     full_size: bool = False
-    """Also ViT-B/14 with random weights, at 224 x 224, 322 x 322 and 224 x 308; and in float32 each
-    published network against outputs of its authors' code: up to 6 GB."""
+    """Also compare ViT-B/14 with random weights, at 224 x 224, 322 x 322 and 224 x 308; and in float32
+    each published network with outputs of its authors' code. Needs up to 6 GB."""
     only: str = ""
-    """Only what has this in its name, in upper or lower case."""
+    """Only rows whose name contains this, ignoring case."""
     seed: int = 0
-    """Draws weights and inputs."""
+    """Seed of weights and inputs."""
     out: pathlib.Path = pathlib.Path("parity-report")
     """Folder for parity.json and parity.md."""
 
@@ -43,11 +43,11 @@ Work = dict[tuple[str, str], Callable[[], list[Row]]]
 
 
 def _plan(arguments: Parity) -> Work:
-    """What to do, by precision and name.
+    """Collect the checks to run, by precision and name.
 
     Raises:
-        InputError: no such precision, a negative seed, nothing of this name in any of the
-            precisions, or a folder that cannot be made.
+        InputError: an unknown precision, a negative seed, no row of this name in any of the
+            precisions, or a folder that can't be created.
     """
     if arguments.seed < 0:
         raise InputError(f"--seed: found {arguments.seed}, expected at least 0")
@@ -76,17 +76,17 @@ def _run(work: Work) -> list[Row]:
     with progress_bar("parity", len(work), "checks", quiet=False) as bar:
         for precision, name in list(work):
             bar.advance(0, f"{precision}: {name}")
-            # Popped, so that the weights of a full size are gone before the next precision's come.
+            # Popped to free full-size weights before those of the next precision are made.
             rows += work.pop((precision, name))()
             bar.advance(1)
     return rows
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command, and return its exit code."""
     try:
         settings = tyro.cli(Parity, prog="python -m parity", args=arguments)
-    except SystemExit as stop:  # 2 after a complaint, 0 after --help
+    except SystemExit as stop:  # 2 after an error, 0 after --help
         return int(stop.code or 0)
     try:
         work = _plan(settings)

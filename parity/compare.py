@@ -1,8 +1,8 @@
-"""Errors between two implementations, the tolerances they are held to and why, rows of the table.
+"""Errors between two implementations, tolerances with their reasons, and rows of the table.
 
 The error of an array is the norm of the difference over the norm of the reference's array. A row
-shows the array with the largest error of those that it covers, so every one of them is held to it;
-or, where that is said, the error of all of them together.
+shows the array with the largest error of those that it covers, so its tolerance holds for all of
+them; or, if stated, the error of all of them together.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ class Tolerance(NamedTuple):
 
 
 TRUTH_FACTOR = 1.5
-"""How much further from float64 our bfloat16 may be than torch's."""
+"""Largest allowed ratio of our bfloat16 error to torch's, both relative to float64."""
 
 EXACT = Tolerance(0.0, "choices, not numbers: every mined pair is the same")
 FROZEN = Tolerance(0.0, "no step touches what is frozen")
@@ -159,11 +159,12 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         ),
     },
 }
-"""Measured is the largest error of seeds 0 to 3 on one processor; at full size, of seed 0.
+""""Measured" is the largest error of seeds 0 to 3 on one processor; at full size, of seed 0.
 
-Sums in another order give other roundings, as another seed does: hence about three times as much,
-in bfloat16 up to five, since processors with and without such arithmetic of their own differ more.
-Past kinks three times bfloat16's would hold nothing: it is above the 1 of a gradient left out.
+Sums in another order round differently, like another seed: hence a tolerance of about three times
+the measured error, and up to five times in bfloat16, because processors with and without native
+bfloat16 differ more. After kinks in bfloat16, three times the error would test nothing: it is above
+1, the error of a missing gradient.
 """
 
 
@@ -175,33 +176,33 @@ class Row:
     quantity: str
     precision: str
     worst: str
-    """Name of the array with the largest relative error, under the torch reference's names."""
+    """Name of the array with the largest relative error, as in the torch reference."""
     shape: tuple[int, ...]
     max_abs: float
     relative: float
     tolerance: float
     why: str
     arrays: int
-    """How many arrays the row covers."""
+    """Number of arrays that the row covers."""
     note: str = ""
 
     @property
     def passed(self) -> bool:
-        """Whether error and tolerance are numbers, the one within the other."""
+        """Whether error and tolerance are numbers, and the error is within the tolerance."""
         finite = math.isfinite(self.relative) and math.isfinite(self.tolerance)
         return finite and self.relative <= self.tolerance
 
 
 def as_double(array: object) -> np.ndarray:
-    """A copy in float64 of an array of numbers or truth values, of either library."""
-    if isinstance(array, torch.Tensor):  # numpy has no bfloat16 of torch's
+    """Copy a numeric or boolean array of either library to float64."""
+    if isinstance(array, torch.Tensor):  # numpy doesn't support torch's bfloat16
         array = array.detach().double().numpy()
     return np.array(array, np.float64)
 
 
-@np.errstate(invalid="ignore")  # what is no number shows in the verdict
+@np.errstate(invalid="ignore")  # NaN shows in the verdict
 def relative_error(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Norm of the difference over the norm of `theirs`; infinite where it is no number.
+    """Return the norm of the difference over the norm of `theirs`; infinite if it is NaN.
 
     Two arrays of zeros agree. Anything else against zeros does not.
     """
@@ -225,11 +226,11 @@ def compare(
     note: str = "",
     error_of: Callable[[np.ndarray, np.ndarray], float] = relative_error,
 ) -> Row:
-    """The row of the worst of several arrays, by `error_of` (ours, theirs).
+    """Make the row of the worst of several arrays, by `error_of` (ours, theirs).
 
-    `noise` names arrays that are 0 but for rounding, each with an array that tells the size of
-    the terms that cancel: the error is then what either side has in place of 0, over that norm.
-    An array that only one side has, or that differs in shape, is an infinite error.
+    `noise` maps arrays that are 0 up to rounding to arrays with the size of the terms that cancel:
+    the error is then the norm of what either side has instead of 0, over the norm of that array.
+    An array that only one side has, or that differs in shape, counts as an infinite error.
     """
     noise = noise or {}
     rows = []
@@ -242,7 +243,7 @@ def compare(
         error = error_of(mine, other)
         if name in noise:
             scale = np.linalg.norm(as_double(theirs[noise[name]]))
-            # Numpy's maximum: Python's would drop a NaN.
+            # Numpy's maximum, because Python's could drop a NaN.
             error = float(np.maximum(np.linalg.norm(mine), np.linalg.norm(other)) / scale)
         error = error if math.isfinite(error) else math.inf
         rows.append((error, float(np.abs(mine - other).max(initial=0.0)), name, mine.shape))
@@ -265,14 +266,14 @@ def compare(
 
 
 def other_signs(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """How many elements have another sign; infinite where one is no number."""
+    """Count the elements that differ in sign; infinite if there is a NaN."""
     if not np.isfinite([ours, theirs]).all():
         return math.inf
     return float(np.sum(np.sign(ours) != np.sign(theirs)))
 
 
 compare_signs = functools.partial(compare, error_of=other_signs)
-"""The row of the array with the most elements of another sign; its error is their number."""
+"""Make the row of the array with the most differing signs; its error is their number."""
 
 
 def compare_joined(
@@ -285,9 +286,9 @@ def compare_joined(
     *,
     note: str = "",
 ) -> Row:
-    """The row of all arrays of `theirs` joined to one, for what is only true of many elements.
+    """Make the row of all arrays of `theirs` joined, for statistics that need many elements.
 
-    Where ours lacks one, or has it in another shape, the error is infinite.
+    If ours lacks one, or has it in another shape, the error is infinite.
     """
     mine, other = {name: ours[name] for name in theirs if name in ours}, theirs
     if {n: x.shape for n, x in mine.items()} == {n: x.shape for n, x in theirs.items()}:
@@ -306,9 +307,9 @@ def compare_truth(
     theirs: Arrays,
     truth: Arrays,
 ) -> Row:
-    """The row of our error from a truth, all arrays of it joined to one, against torch's own.
+    """Make the row of our error relative to a truth, all arrays joined, compared with torch's error.
 
-    Where torch's error is no number there is nothing to be held to: the row misses.
+    If torch's error is NaN, there is no bound, and the row misses.
     """
     their_error = relative_error(_join(theirs[name] for name in truth), _join(truth.values()))
     tolerance = Tolerance(

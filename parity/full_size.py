@@ -1,4 +1,4 @@
-"""The paper's model at full width and depth with random weights: descriptors on both sides."""
+"""Compare descriptors of the paper's model at full width and depth, with random weights."""
 
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ from parity.reference.model import Crisalad as TorchCrisalad
 
 PRESET = "b14"
 SIZES = ((224, 224), (322, 322), (224, 308))
-"""The paper's, DINO-SALAD's, and one that is not square."""
+"""Image sizes: the paper's, DINO-SALAD's, and one that is not square."""
 BATCH = 2
 FEW_ROUNDINGS = Tolerance(
     1e-15, "nine roundings of 1.1e-16 in a sum of 1, where the descriptor's squared is far below"
@@ -25,7 +25,7 @@ FEW_ROUNDINGS = Tolerance(
 
 
 def full_size_checks(precision: str, seed: int) -> dict[str, Callable[[], list[Row]]]:
-    """A check for each size, by name; the weights are made when the first of them runs."""
+    """Make a check for each size, by name; the weights are made when the first check runs."""
 
     @functools.cache
     def sides() -> tuple[TorchCrisalad, Crisalad]:
@@ -63,7 +63,7 @@ def _check(
 
 
 def cosine_row(row: Row, ours: np.ndarray, theirs: np.ndarray) -> Row:
-    """The row of directions, (image, descriptor) each, beside the descriptors' own `row`."""
+    """Make the row that compares directions (image, descriptor), next to the descriptors' `row`."""
     norms = np.linalg.norm(ours, axis=-1) * np.linalg.norm(theirs, axis=-1)
     distance = float(np.abs(1 - (ours * theirs).sum(-1) / norms).max())
     squared = Tolerance(row.tolerance**2, "the descriptor's squared: 1 - cosine is half of that")

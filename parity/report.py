@@ -1,4 +1,4 @@
-"""The table on the terminal, and as a JSON and a Markdown file."""
+"""Format the table for the terminal, JSON and Markdown."""
 
 import dataclasses
 import math
@@ -19,13 +19,13 @@ COLUMNS = ("layer", "what", "worst array", "shape", "max abs", "relative", "tole
 
 
 def versions() -> dict[str, str]:
-    """What the numbers were measured with."""
+    """Return the versions that the numbers were measured with."""
     found = {name: metadata.version(name) for name in PACKAGES}
     return {"python": platform.python_version(), "machine": platform.machine(), **found}
 
 
 def terminal_table(rows: Sequence[Row], precision: str) -> rich.table.Table:
-    """The rows of one precision; misses stand out."""
+    """Make the table of one precision, with misses highlighted."""
     table = rich.table.Table(
         *COLUMNS, title=f"{precision}: JAX against the torch reference", box=rich.box.SIMPLE_HEAD
     )
@@ -38,7 +38,7 @@ def terminal_table(rows: Sequence[Row], precision: str) -> rich.table.Table:
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """One line for all rows."""
+    """Summarise all rows in one line."""
     missed = sum(not row.passed for row in rows)
     return f"{len(rows)} rows, {missed or 'none'} missed"
 
@@ -57,10 +57,10 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 
 def write_report(folder: pathlib.Path, rows: Sequence[Row], settings: Mapping[str, Any]) -> None:
-    """Write `parity.json` and `parity.md` into `folder`, which is made if need be.
+    """Write `parity.json` and `parity.md` into `folder`, which is created if needed.
 
     Raises:
-        InputError: the files cannot be made there.
+        InputError: the files can't be created there.
     """
     found = versions()
     document = {
@@ -76,7 +76,7 @@ def write_report(folder: pathlib.Path, rows: Sequence[Row], settings: Mapping[st
 
 def _plain(row: Row) -> dict[str, Any]:
     plain = dataclasses.asdict(row) | {"passed": row.passed}
-    for name in ("max_abs", "relative", "tolerance"):  # JSON knows no infinity
+    for name in ("max_abs", "relative", "tolerance"):  # JSON has no infinity
         plain[name] = plain[name] if math.isfinite(plain[name]) else None
     return plain
 

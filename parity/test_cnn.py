@@ -1,7 +1,7 @@
-"""Models over ResNet and VGG against the torch reference: descriptors, and gradients of everything.
+"""Compare models over ResNet and VGG with the torch reference: descriptors and all gradients.
 
-In float64 both sides agree but for some hundred roundings of 1e-16, and no ReLU or maximum falls to
-another side; a wrong stride, padding, epsilon or axis shows at 1e-2 and more.
+In float64 both sides agree up to some hundred roundings of 1e-16, and no ReLU or maximum switches
+sides; a wrong stride, padding, epsilon or axis shows at 1e-2 and more.
 """
 
 import equinox as eqx
@@ -26,9 +26,9 @@ from crisalad_jax.nn.model import Crisalad, attend_across_images, tokens_and_sta
 from parity.cases.case import LAYOUT, build, convert
 
 BOUND = 1e-11
-"""A thousand times what float64 makes here; float32 would make 1e-7 of it."""
+"""A thousand times the float64 error here; the float32 error would be 1e-7."""
 SIZE = (37, 52)
-"""Sides that no stride divides."""
+"""Sides that no stride divides evenly."""
 
 
 @pytest.mark.parametrize(
@@ -73,13 +73,13 @@ def test_descriptors_and_gradients(backbone: Backbone, aggregator: Aggregator) -
     assert len(expected) > 20
     for name, gradient in expected.items():
         error = np.linalg.norm(ours[name] - gradient)
-        # A bias before a norm has no gradient but rounding: the whole's size is the scale.
+        # The gradient of a bias before a norm is only rounding, so the scale is the whole gradient.
         assert error < BOUND * np.linalg.norm(gradient) + 1e-14, name
 
 
 @pytest.mark.slow
 def test_a_training_batch_is_normalised_as_torch_does() -> None:
-    """Descriptors, gradients through the batch's statistics, and the running ones after it."""
+    """Descriptors, gradients through batch statistics, and the updated running statistics."""
     config = ModelConfig(
         image_size=SIZE,
         backbone=ResNetConfig(layers=18, stages=2),

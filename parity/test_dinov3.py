@@ -1,8 +1,8 @@
-"""DINOv3 beside Hugging Face's DINOv3ViTModel: names, features, facets, gradients, sizes.
+"""Compare DINOv3 with Hugging Face's DINOv3ViTModel: names, features, facets, gradients, sizes.
 
 Weights are random and reach transformers through files. The bounds are those of DINOv2
 (test_independent.py), 1e-5 on outputs and 1e-4 on gradients; 1.8e-6 and 5e-6 are measured here.
-Swapped rows and columns, another pairing of numbers, or a bias of the keys show at 1e-2 and more.
+Swapped rows and columns, another pairing of dimensions, or a key bias show at 1e-2 and more.
 """
 
 import pathlib
@@ -40,11 +40,11 @@ OBLONG = (3, 5)
 GATED = [False, True]
 PERIODS = [1, 1.3359375, 1.78125, 2.375, 3.15625, 4.21875, 5.625, 7.5]
 PERIODS += [10, 13.3125, 17.75, 23.75, 31.625, 42.25, 56.25, 75]
-"""The periods that the public .pth files hold, rounded to bfloat16."""
+"""The periods in the public .pth files, rounded to bfloat16."""
 
 
 def hugging_face(gated: bool) -> Any:
-    """Two blocks with random parameters, none left at its start."""
+    """Make a model of two blocks with random parameters, none at its initial value."""
     torch.manual_seed(0)
     config = DINOv3ViTConfig(
         hidden_size=128,
@@ -62,7 +62,7 @@ def hugging_face(gated: bool) -> Any:
 
 
 def expected_config(gated: bool) -> ModelConfig:
-    # As published: SwiGLU's two thirds of six times the width.
+    # As published: SwiGLU with two thirds of six times the width.
     sizes: dict[str, Any] = {"ffn": "swiglu", "mlp_ratio": 6.0} if gated else {}
     backbone = DinoV3Config(dim=128, depth=2, heads=2, adapter="none", **sizes)
     return ModelConfig(backbone=backbone, aggregator=ClassTokenConfig(), cross_image="none")
@@ -75,7 +75,7 @@ def pixels(grid: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("gated", GATED)
 def test_names_are_transformers_own(gated: bool, tmp_path: pathlib.Path) -> None:
-    """Its file to ours and back is the same file, by way of the other layout too."""
+    """Converting its file to ours and back gives the same file, also via the other layout."""
     model = hugging_face(gated)
     path = saved(model, tmp_path)
     theirs = load_file(path)
@@ -103,10 +103,10 @@ def test_names_are_transformers_own(gated: bool, tmp_path: pathlib.Path) -> None
 
 
 def as_facebooks(state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """A state of transformers' under facebookresearch/dinov3's names.
+    """Rename a transformers state to facebookresearch/dinov3's names.
 
-    The names are those that transformers' script of conversion maps from: w1 is SwiGLU's gate, w2
-    its value, and keys have no bias.
+    These are the names that transformers' conversion script maps from: w1 is SwiGLU's gate, w2 its
+    value, and keys have no bias.
     """
     words = {
         "embeddings.patch_embeddings": "patch_embed.proj",
@@ -178,13 +178,13 @@ def test_dinov3_is_transformers(gated: bool, grid: tuple[int, int], tmp_path: pa
             assert not array.any()
         else:
             assert relative_error(actual[name], array) < GRADIENT_BOUND, name
-    # No weight decay or step moves the bias that is not there.
+    # No weight decay or step moves the absent bias.
     of_keys = np.split(params_gradient.backbone.blocks.attn.qkv.bias, 3, axis=1)[1]
     assert not of_keys.any()
 
 
 def test_facets_are_transformers(tmp_path: pathlib.Path) -> None:
-    """What its linear layers give, before queries and keys are rotated."""
+    """Outputs of the linear layers, before queries and keys are rotated."""
     model = hugging_face(gated=False)
     found = read_checkpoint(saved(model, tmp_path))
     images = pixels(OBLONG)
@@ -238,7 +238,7 @@ def test_published_sizes_are_transformers(name: str) -> None:
     model = published_model(name)
     parameters = sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(found)))
     assert (model.descriptor, model.parameters) == (found.descriptor_dim, parameters)
-    # Ours have a place for the keys' bias, always 0, and no mask token.
+    # Ours have a key bias, always 0, and no mask token.
     theirs = sum(array.size for array in blank.values())
     assert parameters == theirs + depth * dim - dim
 
@@ -248,7 +248,7 @@ def test_all_published_sizes_are_there() -> None:
 
 
 def test_a_file_of_facebooks_is_the_same_bytes(tmp_path: pathlib.Path) -> None:
-    """There and back; one that is written of transformers' has the published periods."""
+    """Round trip; a file written from a transformers state has the published periods."""
     found = read_checkpoint(saved(hugging_face(gated=False), tmp_path))
     path = tmp_path / "meta.pth"
     write_checkpoint(path, found.params, found.config, "dinov3", found.extras)

@@ -1,4 +1,4 @@
-"""AnyLoc's facets, of ours and of the torch reference, beside Hugging Face's Dinov2Model."""
+"""Compare AnyLoc's facets, ours and the torch reference's, with Hugging Face's Dinov2Model."""
 
 import dataclasses
 import pathlib
@@ -27,7 +27,7 @@ from parity.test_independent import (
 
 
 def their_facets(model: Any, images: torch.Tensor, number: int) -> dict[str, np.ndarray]:
-    """What its linear layers and its block leave, class token and registers included."""
+    """Return outputs of its linear layers and its block, with class token and registers."""
     layer = model.encoder.layer[number]
     found: dict[str, np.ndarray] = {}
 
@@ -51,7 +51,7 @@ def their_facets(model: Any, images: torch.Tensor, number: int) -> dict[str, np.
 def assert_close(found: np.ndarray, expected: np.ndarray) -> None:
     assert found.shape == expected.shape
     error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
-    assert error < OUTPUT_BOUND  # that of all stored outputs: roundings along two blocks
+    assert error < OUTPUT_BOUND  # the bound of all stored outputs: roundings along two blocks
 
 
 @pytest.mark.parametrize(

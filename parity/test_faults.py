@@ -1,4 +1,4 @@
-"""Deliberate faults on our side: the check that `python -m parity` runs must miss each of them."""
+"""Plant deliberate faults on our side: each must make a row of `python -m parity` miss."""
 
 import dataclasses
 import functools
@@ -32,7 +32,7 @@ FORWARD = {"forward"}
 
 @pytest.fixture(autouse=True)
 def fresh_constants() -> Iterator[None]:
-    """Constants that are kept would not know of a fault; nor, later, of its end."""
+    """Clear cached constants, which would ignore a fault, and later its removal."""
     vit.bicubic_weights.cache_clear()
     yield
     vit.bicubic_weights.cache_clear()
@@ -40,7 +40,7 @@ def fresh_constants() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def hasty_programs() -> Iterator[None]:
-    """A fault is not of rounding: programs that compile faster show it as well."""
+    """Compile with fewer optimisations: faults are larger than rounding, and still show."""
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
@@ -48,7 +48,7 @@ def hasty_programs() -> Iterator[None]:
 
 @pytest.fixture
 def fresh_programs() -> Iterator[None]:
-    """Nor would the programs of functions that are compiled by themselves, such as `train_step`."""
+    """Clear compiled functions, such as `train_step`, which would ignore a fault too."""
     jax.clear_caches()
     yield
     jax.clear_caches()
@@ -59,7 +59,7 @@ def missed(name: str, precision: str = "float32") -> set[str]:
 
 
 def swap(first: str, second: str) -> Callable[[Patch], None]:
-    """Confuse two arrays of the state while it is converted."""
+    """Swap two arrays of the state during conversion."""
 
     def fault(patch: Patch) -> None:
         right = parity.cases.case.to_params
@@ -74,7 +74,7 @@ def swap(first: str, second: str) -> Callable[[Patch], None]:
 
 
 def replace(module: Any, name: str, make: Callable[[Any], Any]) -> Callable[[Patch], None]:
-    """Put `make(what it is)` in the place of a function or constant."""
+    """Replace a function or constant by `make` of it."""
     return lambda patch: patch.setattr(module, name, make(getattr(module, name)))
 
 
@@ -88,7 +88,7 @@ def _without_layer_scale(block: Any) -> Any:
 
 def _special_tokens_once(mlp_update: Any) -> Any:
     def wrong(self: Any, params: Any, tokens: Any, info: TokenInfo) -> Any:
-        # Without bias, half of what counts twice is what counts once.
+        # Without bias, halving what counts twice makes it count once.
         special = tokens.shape[-2] - math.prod(info.grid)
         adapted, updated = mlp_update(self, params, tokens, info)
         return adapted.at[..., :special, :].multiply(0.5), updated
@@ -277,7 +277,7 @@ def _two_bits_short(linear: Any) -> Any:
 @pytest.mark.parametrize(
     ("fault", "quantities"),
     [
-        # What a processor with bfloat16 arithmetic makes of a bias that is added in bfloat16.
+        # The result of a bias added in bfloat16 on a processor with native bfloat16.
         (_bias_in_8_bits, {"gradients, from float64"}),
         (_two_bits_short, {"forward, from float64", "gradients, from float64"}),
     ],

@@ -1,4 +1,4 @@
-"""FoL beside a model in torch under the public names, and its attention beside transformers'."""
+"""Compare FoL with a torch model under the public names, and its attention with transformers'."""
 
 import dataclasses
 import pathlib
@@ -59,7 +59,7 @@ class TorchFol(nn.Module):
         self.upconv2 = nn.ConvTranspose2d(HEAD.local_hidden, HEAD.local, 3, stride=2, padding=1)
 
     def attention(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """The class token's attention to each patch in the last block, and that block's output."""
+        """Return the class token's attention to each patch in the last block, and its output."""
         model, grid = self.backbone["model"], grid_of(images)
         assert isinstance(model, ViT)
         tokens = model.embed(images)
@@ -76,12 +76,12 @@ class TorchFol(nn.Module):
         return found[:, 1:], model.norm(last(tokens, grid))
 
     def forward(self, images: Tensor) -> Tensor:
-        """(batch, 3, height, width) to unit descriptors."""
+        """Map (batch, 3, height, width) to unit descriptors."""
         attention, tokens = self.attention(images)
         maps = tokens[:, 1:].mT.unflatten(-1, grid_of(images))
         score = self.aggregator["score"](maps).flatten(2)
         dustbin = 1 - attention * (attention >= 0.01)
-        # Sinkhorn in the domain of masses: a row each cluster, the dustbin's last.
+        # Sinkhorn in the scaling domain: one row per cluster, the dustbin last.
         kernel = torch.cat([score, dustbin[:, None]], dim=1).double().exp()
         clusters, patches = score.shape[1:]
         masses = torch.tensor([1.0] * clusters + [patches - clusters]).double()
@@ -152,5 +152,5 @@ def test_the_class_tokens_attention_is_transformers(kind: Kind, tmp_path: pathli
 
     found, change = features(jnp.asarray(images))
     assert relative_error(found, expected) < OUTPUT_BOUND
-    # Asking changes no feature but by float32's roundings of a program cut elsewhere.
+    # Returning attention changes features only by float32 rounding, as programs are split differently.
     assert float(jnp.abs(change).max()) < 1e-4

@@ -1,4 +1,4 @@
-"""Outputs and gradients of the public torch implementations, reproduced from stored files.
+"""Reproduce outputs and gradients of the public torch implementations from stored files.
 
 Each file of goldens/ holds random weights and inputs, the public implementation's outputs, the loss
 sum(sin(3 x)) over them and its gradients. Errors are the norm of the difference over the norm. The
@@ -41,22 +41,22 @@ from crisalad_jax.utils.pytree import named_leaves
 GOLDENS = pathlib.Path(__file__).parent / "goldens"
 OUTPUT_BOUND, GRADIENT_BOUND = 1e-5, 1e-4
 NO_GRADIENT = ("mask_token", "running_mean", "running_var")
-"""Last parts of the names of what the public models hold and do not differentiate."""
+"""Name endings of arrays that the public models store but do not differentiate."""
 
 State = Mapping[str, np.ndarray]
 
 
 class Names(NamedTuple):
-    """From public names to our parameters, and from our gradients to public names."""
+    """Conversions from public names to our parameters, and from our gradients to public names."""
 
     ours: Callable[[State], Any]
     theirs: Callable[[Any], dict[str, np.ndarray]]
 
 
 def part_names(rows: Rows, template: Any, prefix: str = "", public: str = "") -> Names:
-    """For one part of a model, by its table, and what comes before all names that it has.
+    """Make the names of one part of a model, from its table and prefixes.
 
-    Of `template` only the structure counts.
+    Only the structure of `template` is used.
     """
     structure = jax.tree.structure(template)
     order = [prefix + name for name in named_leaves(template)]
@@ -115,7 +115,7 @@ def check(
     loss, (params_grad, inputs_grad) = jax.jit(
         jax.value_and_grad(lambda p, x: golden_loss(function(p, x)), argnums=(0, 1))
     )(params, inputs)
-    # The loss is a sum of thousands of terms of both signs: its rounding scales with their count.
+    # The loss sums thousands of terms of both signs, so its rounding scales with their count.
     count = sum(output.size for output in outputs.values())
     assert abs(loss - golden["loss"]) < 1e-6 * count
     expected = under(golden, "grad.")
@@ -166,8 +166,8 @@ def test_vit(name: str, registers: int) -> None:
 
 def test_multi_resolution_adapter() -> None:
     golden = load("multiconv_adapter")
-    # The stored one narrows 24 channels to 4, not to a sixteenth: our configuration has the names
-    # and the structure, not the widths.
+    # The stored adapter narrows 24 channels to 4, not to a sixteenth: our configuration gives the
+    # names and the structure, not the widths.
     config = MultiResolutionConfig(bottleneck=1.0, alpha=1.0)
     shape = ViTConfig(dim=48, heads=3).block_shape
     template = jax.eval_shape(lambda key: config.init(key, shape), jax.random.key(0))
@@ -197,8 +197,8 @@ def test_salad() -> None:
     )
     names = part_names(HEADS["salad"].rows, template)
     inputs = {name: jnp.asarray(golden[f"in.{name}"]) for name in ("features", "token")}
-    # A constant added to a column of scores is absorbed by the column's potential: the dustbin's
-    # score and the score network's last bias have no effect, their gradients are rounding noise.
+    # A column's potential absorbs a constant added to its scores: the dustbin's score and the score
+    # network's last bias have no effect, and their gradients are rounding noise.
     dead = ("dust_bin", "score.3.bias")
     check(function, golden, names, inputs, exempt=dead)
     params = names.ours(under(golden, "state."))
@@ -231,7 +231,7 @@ def test_sinkhorn(case: int) -> None:
     assert relative_error(log_plan(scores, dustbin), golden["log_p"]) < OUTPUT_BOUND
     scores_grad, dustbin_grad = jax.grad(loss, argnums=(0, 1))(scores, dustbin)
     assert relative_error(scores_grad, golden["grad_scores"]) < GRADIENT_BOUND
-    # Noise around 0 on both sides: the dustbin's constant score is absorbed by its potential.
+    # Noise around 0 on both sides: the dustbin's potential absorbs its constant score.
     noise = 1e-5 * np.abs(golden["grad_scores"]).sum()
     assert abs(dustbin_grad) < noise
     assert abs(golden["grad_dustbin"]) < noise

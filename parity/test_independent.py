@@ -1,9 +1,9 @@
-"""Ours beside libraries that know nothing of it: Hugging Face's transformers and torch's encoder.
+"""Compare with independent libraries: Hugging Face's transformers and torch's encoder.
 
-Weights are random and reach transformers through files, both ways, so that the public names are its
-own. Errors are the norm of the difference over the norm, array by array. In float32 the bounds are
+Weights are random and reach transformers through files, both ways, so that transformers supplies
+the public names. Errors are the norm of the difference over the norm, array by array. In float32 the bounds are
 those of the stored outputs (test_goldens.py), 1e-5, and 1e-4 on gradients: eight and twenty times
-what is measured here, 1.2e-6 and 5e-6, which are roundings of 6e-8 along two blocks and back. A
+the errors measured here, 1.2e-6 and 5e-6, from roundings of 6e-8 along two blocks and back. A
 wrong constant or axis shows at 1e-3 and more.
 """
 
@@ -55,12 +55,12 @@ from parity.test_goldens import (
 
 PATCH = 14
 SIDE = 6
-"""Of the stored grid of positions; 4 x 9 patches are as many and yet another grid."""
+"""Side of the stored grid of positions; 4 x 9 is another grid with the same number of patches."""
 FILE = "model.safetensors"
 
 
 class Kind(NamedTuple):
-    """A model of transformers, and what our configuration has to say about it."""
+    """A model of transformers, and our configuration fields for it."""
 
     registers: int
     gated: bool
@@ -73,7 +73,7 @@ NATIVE = (SIDE, SIDE)
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """The arrays are too small to share out."""
+    """Use one thread, because the arrays are too small to split."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -81,7 +81,7 @@ def one_thread() -> Iterator[None]:
 
 
 def hugging_face(kind: Kind) -> Any:
-    """Two blocks with random parameters, none left at its start."""
+    """Make a model of two blocks with random parameters, none at its initial value."""
     torch.manual_seed(0)
     sizes: dict[str, Any] = {
         "hidden_size": 128,
@@ -102,7 +102,7 @@ def hugging_face(kind: Kind) -> Any:
 
 
 def shake(module: nn.Module) -> None:
-    """Add noise to every parameter; gains stay around 1 and outputs around their inputs' size."""
+    """Add noise to every parameter, with gains around 1 and outputs of the size of their inputs."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -127,13 +127,13 @@ def expected_config(kind: Kind) -> ModelConfig:
 
 
 def saved(model: Any, folder: pathlib.Path) -> pathlib.Path:
-    """The file that transformers publishes a model as: names differ from its modules' own."""
+    """Save the file that transformers publishes; its names differ from those of the modules."""
     model.save_pretrained(folder)
     return folder / FILE
 
 
 def gradients_by_public_name(model: Any, folder: pathlib.Path) -> dict[str, np.ndarray]:
-    """Gradients in the place of parameters, so that transformers itself renames them."""
+    """Return gradients, saved in place of parameters so that transformers renames them."""
     holder = copy.deepcopy(model)
     with torch.no_grad():
         for target, source in zip(holder.parameters(), model.parameters(), strict=True):
@@ -142,11 +142,11 @@ def gradients_by_public_name(model: Any, folder: pathlib.Path) -> dict[str, np.n
 
 
 def interpolate_as_published(model: Any) -> None:
-    """Give transformers' model without registers the offset that DINOv2's has.
+    """Give transformers' model without registers the offset of DINOv2's.
 
-    facebookresearch/dinov2 asks torch for the scale (size + 0.1) / side, so that a size is never
-    rounded down; transformers asks for the size, and so for the scale size / side. Its model with
-    registers and DINOv2's ask for the size both, antialiased.
+    facebookresearch/dinov2 passes the scale (size + 0.1) / side to torch, so that a size is never
+    rounded down; transformers passes the size, which means the scale size / side. With registers,
+    both pass the size, with antialiasing.
     """
 
     def positions(_: Tensor, height: int, width: int) -> Tensor:
@@ -174,13 +174,13 @@ def our_features(params: Crisalad, images: Any, config: ModelConfig) -> dict[str
 
 
 def torch_loss(outputs: dict[str, Tensor]) -> Tensor:
-    """`golden_loss` in torch."""
+    """Compute `golden_loss` in torch."""
     return torch.stack([torch.sin(3 * output).sum() for output in outputs.values()]).sum()
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=str)
 def test_names_are_transformers_own(kind: Kind, tmp_path: pathlib.Path) -> None:
-    """Its file to ours and back is the same file; and it loads, to the same bits, what we write."""
+    """Converting its file to ours and back is lossless, and it loads our file bit for bit."""
     model = hugging_face(kind)
     path = saved(model, tmp_path)
     theirs = load_file(path)
@@ -238,7 +238,7 @@ def test_vit_is_transformers(kind: Kind, grid: tuple[int, int], tmp_path: pathli
         if name.endswith(NO_GRADIENT):
             assert not array.any()
         elif name.endswith("key.bias"):
-            # Softmax absorbs it: rounding noise beside the queries' bias.
+            # Softmax absorbs it: rounding noise compared with the queries' bias.
             scale = np.linalg.norm(expected[name.replace("key", "query")])
             assert np.linalg.norm(array) < GRADIENT_BOUND * scale, name
             assert np.linalg.norm(actual[name]) < GRADIENT_BOUND * scale, name
@@ -250,10 +250,10 @@ def test_vit_is_transformers(kind: Kind, grid: tuple[int, int], tmp_path: pathli
 def test_transformers_interpolates_without_the_offset(
     grid: tuple[int, int], tmp_path: pathlib.Path
 ) -> None:
-    """A deviation of transformers' from DINOv2, and from ours: a hundred times the bound and more.
+    """transformers deviates from DINOv2, and from ours, by more than a hundred times the bound.
 
-    So the test above sees the offset that `interpolate_as_published` brings back. If this one
-    fails, transformers has it too by now, and neither is needed any more.
+    So the test above detects the offset that `interpolate_as_published` restores. If this test
+    fails, transformers has adopted the offset, and neither is needed any more.
     """
     model = hugging_face(Kind(0, gated=False))
     found = read_checkpoint(saved(model, tmp_path))
@@ -266,12 +266,12 @@ def test_transformers_interpolates_without_the_offset(
 
 
 def test_training_is_that_of_the_libraries(tmp_path: pathlib.Path) -> None:
-    """20 steps of `train_step`; on the other side nothing of ours.
+    """Compare 20 steps of `train_step` with a training that uses none of our code.
 
-    There transformers has the model, pytorch-metric-learning the miner and loss, and torch AdamW
-    and its linear decay. In float64, or else AdamW would turn the signs of gradients that are
-    rounding noise into steps. Bytes of 0 and 255, and a rate that is a power of 2 as are the steps
-    of its decay, are exact in every precision.
+    There, the model is from transformers, the miner and loss from pytorch-metric-learning, AdamW and
+    its linear decay from torch. It runs in float64, because AdamW would otherwise turn the signs of
+    rounding noise into steps. Bytes of 0 and 255, and a rate and decay steps that are powers of 2,
+    are exact in every precision.
     """
     steps, planned, rate, weight_decay = 20, 32, 2**-10, 0.5
     labels = np.array([0, 0, 1, 1, 2, 2], np.int32)
@@ -335,16 +335,16 @@ def test_training_is_that_of_the_libraries(tmp_path: pathlib.Path) -> None:
             assert way == 0
             np.testing.assert_array_equal(ours[name], array)
             continue
-        # Of the way from the start: 0.7% and more of the arrays' norms. Measured 4e-13, and 1e-9
-        # for what softmax absorbs: its gradients are noise, and beside AdamW's epsilon of 1e-8
-        # no longer nothing.
+        # Relative to the distance from the start, at least 0.7% of the arrays' norms. Measured 4e-13,
+        # and 1e-9 for what softmax absorbs: its gradients are noise, but not negligible compared
+        # with AdamW's epsilon of 1e-8.
         assert way > 5e-3 * np.linalg.norm(array), name
         bound = 1e-7 if name.endswith("key.bias") else 1e-10
         assert np.linalg.norm(ours[name] - array) < bound * way, name
 
 
 def test_masked_encoder_is_torchs() -> None:
-    """Outputs and all gradients under a mask that is not symmetric; without one see the goldens."""
+    """Outputs and all gradients with an asymmetric mask; the goldens test it without a mask."""
     config = CrossImageConfig(layers=2, heads=4, feedforward=24)
     layer = nn.TransformerEncoderLayer(16, 4, 24, activation="gelu")
     encoder = nn.TransformerEncoder(layer, 2, enable_nested_tensor=False).eval()

@@ -1,6 +1,6 @@
-"""The rows of `python -m parity` as tests: layers, models and training runs in float32.
+"""Run the rows of `python -m parity` as tests: layers, models and training runs in float32.
 
-Of bfloat16 and float64 a few are taken; all others, and the full size, are marked slow.
+The tests include a few bfloat16 and float64 rows; the others, and the full size, are marked slow.
 """
 
 from typing import Any
@@ -20,9 +20,9 @@ NAMES = [what.name for what in (*CASES, *RUNS)]
 SLOW = {
     "Sinkhorn: 100 iterations, epsilon 1.0",
     "DINO-SALAD",  # a part of CriSALAD
-    "NetVLAD's descriptor",  # the aggregators have rows of their own
+    "NetVLAD's descriptor",  # the aggregators have separate rows
     "AnyLoc's descriptor",
-    "training CriSALAD's adapters and head",  # quick in float64
+    "training CriSALAD's adapters and head",  # faster in float64
     "training CriSALAD's last block and head",
     "training CricaVPR's adapters and head",
 }
@@ -68,12 +68,12 @@ def test_parity(precision: str, name: str, monkeypatch: pytest.MonkeyPatch) -> N
             drawn = {n: draw(random(name, SEED)) for n, draw in case.inputs.items()}
             reals = {n for n, x in drawn.items() if np.issubdtype(x.dtype, np.floating)}
             assert reals <= covered["gradients"]
-            # The whole model: all of it has a gradient, but for what lies behind AnyLoc's facet.
+            # The whole model has gradients, except for what comes after AnyLoc's facet.
             if case.forward == "descriptor" and case.model is not ANYLOC:
                 names = dict(build(case.model, precision, random(name, SEED)).named_parameters())
                 del names["backbone.mask_token"]
                 parts = split({n: p.detach().float().numpy() for n, p in names.items()})
-                # Of those that cancel rounding may leave exactly 0.
+                # For gradients that cancel, rounding may leave exactly 0.
                 dead = cancelling(parts).keys()
                 assert covered["gradients"] - dead == (parts.keys() | reals) - dead
 
@@ -87,7 +87,9 @@ def test_the_miner_takes_some_pairs_and_leaves_some(seed: int) -> None:
     found = case.part.theirs(model, inputs, model.config)
     labels = inputs["labels"]
     same = labels[:, None] == labels
-    assert 0 < found["positives"].sum() < same.sum() - len(labels)  # an image is none of its own
+    assert (
+        0 < found["positives"].sum() < same.sum() - len(labels)
+    )  # an image is not its own positive
     assert 0 < found["negatives"].sum() < (~same).sum()
 
 

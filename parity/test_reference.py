@@ -1,6 +1,6 @@
-"""The torch reference against the public implementations: stored outputs, gradients, and names.
+"""Compare the torch reference with the public implementations: outputs, gradients and names.
 
-Where a library has the same thing, against the library: torch's own transformer layers,
+If a library has the same layer, the library is the reference: torch's transformer layers,
 pytorch-metric-learning's miner and loss. Errors are the norm of the difference over the norm. Both
 sides are torch's float32 kernels: bounds are ten to twenty of its roundings of 6e-8, and ten times
 that on gradients; a wrong constant or axis shows at 1e-2 and more.
@@ -61,7 +61,7 @@ MODEL = ModelConfig(
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """The arrays are too small to share out: handing them over takes longer than the work."""
+    """Use one thread: the arrays are so small that splitting them takes longer than the work."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -109,7 +109,7 @@ def check(
 
 
 def ready(module: nn.Module, golden: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Load the stored state, all names of it and no others; return the inputs."""
+    """Load exactly the stored state, and return the inputs."""
     module.load_state_dict(under(golden, "state."), strict=True)
     module.eval()
     return {name: x.requires_grad_() for name, x in under(golden, "in.").items()}
@@ -142,7 +142,7 @@ def test_vit(name: str, registers: int) -> None:
 def test_multi_resolution_adapter() -> None:
     golden = golden_of("multiconv_adapter")
     adapter = MultiResolutionAdapter(48, 24)
-    # The stored one narrows 24 channels to 4, not to a sixteenth.
+    # The stored adapter narrows 24 channels to 4, not to a sixteenth.
     adapter.branch2 = nn.Sequential(ConvNorm(24, 4, 1), ConvNorm(4, 6, 3))
     adapter.branch3 = nn.Sequential(ConvNorm(24, 4, 1), ConvNorm(4, 6, 5))
     inputs = ready(adapter, golden)
@@ -163,13 +163,13 @@ def test_salad() -> None:
             cross_image="none",
         )
     )
-    # A constant added to a cluster's scores is absorbed by the cluster's potential: the dustbin's
-    # score and the score network's last bias have no effect, their gradients are rounding noise.
+    # A cluster's potential absorbs a constant added to its scores: the dustbin's score and the score
+    # network's last bias have no effect, and their gradients are rounding noise.
     dead = ("dust_bin", "score.3.bias")
     check(salad, golden, inputs, {"descriptor": model.attend_across_images(tokens)}, exempt=dead)
     plan = salad.transport(inputs["features"]).exp()
     assert relative_error(plan, golden["aux.assignment_with_dustbin"]) < OUTPUT_BOUND
-    # float64 tells noise, which falls from 5e-7 to 1e-15, from a small effect, which would stay.
+    # float64 separates noise, which falls from 5e-7 to 1e-15, from a small effect, which remains.
     salad.double()
     salad.zero_grad()
     tokens = salad(Features(inputs["token"].double(), inputs["features"].double()))
@@ -186,13 +186,13 @@ def test_sinkhorn(case: int) -> None:
     config, epsilon = SinkhornConfig(iterations=int(golden["num_iters"])), float(golden["reg"])
     scores, dust_bin = golden["scores"].requires_grad_(), torch.ones((), requires_grad=True)
     log_plan = assign_with_dustbin(scores, dust_bin, epsilon=epsilon, config=config)
-    # Scores over a regularisation of 0.1 are ten times as large, and so are their roundings.
+    # With a regularisation of 0.1, scores and their roundings are ten times as large.
     assert relative_error(log_plan, golden["log_p"]) < OUTPUT_BOUND / min(epsilon, 1)
     golden_loss({"plan": log_plan.exp()}).backward()
     assert scores.grad is not None
     assert dust_bin.grad is not None
     assert relative_error(scores.grad, golden["grad_scores"]) < GRADIENT_BOUND
-    # Noise around 0: the dustbin's constant score is absorbed by its potential.
+    # Noise around 0: the dustbin's potential absorbs its constant score.
     assert dust_bin.grad.abs() < 1e-5 * golden["grad_scores"].abs().sum()
 
 
@@ -212,7 +212,7 @@ def test_masked_encoder_is_torchs() -> None:
     ours.load_state_dict(theirs.state_dict(), strict=True)
     tokens = torch.randn(5, 7, 16)
     mask = torch.eye(5, dtype=torch.bool) | (torch.rand(5, 5) < 0.5)
-    # Torch's mask says who may not look.
+    # Torch's mask marks the pairs that may not attend.
     assert relative_error(ours(tokens, mask), theirs(tokens, mask=~mask)) < OUTPUT_BOUND
     assert relative_error(ours(tokens, mask), ours(tokens)) > 1e-2
 
@@ -234,10 +234,10 @@ def outputs(x: Tensor | Tokens) -> list[Tensor]:
 
 
 def test_pyramid_of_the_published_grid() -> None:
-    """Cuts at 8, and at 5 and 11, of 16; each mean from its definition, in float64."""
+    """Cuts of 16 at 8, and at 5 and 11; each mean by its definition, in float64."""
     torch.manual_seed(0)
     patches = torch.randn(2, 6, 16, 16)
-    # One exponent that is no whole number.
+    # An exponent that is not an integer.
     pyramid = GemPyramid()
     nn.init.constant_(pyramid.p, 2.5)
     found = pyramid(UnitPatches()(patches))
@@ -263,7 +263,7 @@ def dinov2(size: str, registers: int = 0, adapter: str = NO_ADAPTER) -> ViTConfi
     return ViTConfig(dim, depth, heads, ffn=ffn, registers=registers, adapter=adapter)
 
 
-# The published model of each layout, and what the reference's names are there.
+# The published model of each layout, and the reference's names in it.
 PUBLIC: dict[str, tuple[ModelConfig, dict[str, str]]] = {
     f"dinov2_vit{size}14{suffix}": (
         ModelConfig(
@@ -302,7 +302,7 @@ def test_names_and_shapes_are_the_public_ones(layout: str) -> None:
 
 
 def random_batch(seed: int) -> tuple[Tensor, Tensor]:
-    """Places of different sizes and tightness, so that miners find many, few or no pairs."""
+    """Draw places with different sizes and spreads, so that miners find many, few or no pairs."""
     generator = torch.Generator().manual_seed(seed)
     images = int(torch.randint(2, 24, (), generator=generator))
     labels = torch.randint(0, 1 + seed % 8, (images,), generator=generator)
@@ -316,7 +316,7 @@ def test_miner_and_loss_are_the_librarys(base: float) -> None:
     config = LossConfig(pml_compat=True, kind=MultiSimilarityConfig(base=base))
     distance = DotProductSimilarity(normalize_embeddings=False)
     miner = MultiSimilarityMiner(config.miner_margin, distance=distance)
-    # Any: a type checker takes them for int, after the library's defaults.
+    # Any: a type checker would infer int from the library's defaults.
     constants: Any = dataclasses.astuple(config.kind)
     loss_of = MultiSimilarityLoss(*constants, distance=distance)
     nonzero = 0
@@ -328,14 +328,14 @@ def test_miner_and_loss_are_the_librarys(base: float) -> None:
         assert set(zip(a2.tolist(), n.tolist(), strict=True)) == entries(negatives)
         theirs = loss_of(x, labels, pairs)
         ours, easy_anchor_fraction = multi_similarity_loss(x, labels, config)
-        # An exponent of 50 times a similarity carries 50 roundings.
+        # An exponent of 50 times a similarity amplifies rounding 50 times.
         torch.testing.assert_close(ours, theirs.reshape(()), rtol=1e-5, atol=1e-7)
         assert easy_anchor_fraction.item() == pytest.approx(1 - len(set(a1.tolist())) / len(x))
         (expected,) = torch.autograd.grad(theirs, x)
         (actual,) = torch.autograd.grad(ours, x)
         torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-6)
         nonzero += ours.item() > 0
-    assert nonzero > 10  # the comparison is not of zeros alone
+    assert nonzero > 10  # the comparison is not only of zeros
 
 
 def entries(pairs: Tensor) -> set[tuple[int, ...]]:
@@ -367,18 +367,18 @@ def test_only_what_trains_moves(trainable: str, moving: tuple[str, ...], kind: K
     torch.manual_seed(0)
     backbone = ViTConfig(dim=32, depth=2, heads=2, position_grid=3, adapter=kind)
     model = Crisalad(dataclasses.replace(MODEL, backbone=backbone))
-    # From 0 no weight decay would move a parameter, nor a gradient one behind a dead ReLU.
+    # Weight decay would not move a parameter at 0, nor a gradient one after a dead ReLU.
     for parameter in model.parameters():
         nn.init.uniform_(parameter, 0, 0.1)
     before = {name: x.clone() for name, x in model.state_dict().items()}
     config = TrainConfig(trainable=trainable, optimiser=OptimiserConfig(learning_rate=1e-3))
     train(model, [batch()] * 2, config, steps=4)
     moved = {name for name, x in model.state_dict().items() if not torch.equal(x, before[name])}
-    # Frozen or not, batch norms follow their batches.
+    # Batch norms update with their batches, frozen or not.
     buffers = {name for name, _ in model.named_buffers()}
     assert len(buffers) == (0 if kind == "depthwise" else 2 * 5 * 3)
     assert buffers <= moved
-    # The mask token is in no output: it has no gradient, and does not decay either.
+    # The mask token affects no output: it has no gradient, and does not decay.
     expected = {
         name
         for name, _ in model.named_parameters()
@@ -423,16 +423,16 @@ def test_what_cannot_train(trainable: str) -> None:
 
 
 class Other(Aggregator):
-    """One that a plug-in would bring."""
+    """An aggregator as from a plug-in."""
 
     part_name = "other"
 
     def token_shape(self, dim: int) -> TokenShape:
-        """A global token."""
+        """Return the shape of a global token."""
         return TokenShape(dim, 0, dim)
 
     def apply(self, *args: Any, **more: Any) -> Any:
-        """Nothing: the reference refuses it first."""
+        """Never runs, because the reference raises first."""
 
 
 def test_an_aggregator_of_a_plug_in_is_not_held() -> None:

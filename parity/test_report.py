@@ -1,4 +1,4 @@
-"""Errors, verdicts, the files and the exit codes."""
+"""Test errors, verdicts, the files and the exit codes."""
 
 import dataclasses
 import json
@@ -68,7 +68,7 @@ def test_arrays_joined_are_one() -> None:
 
 
 def test_signs_are_counted_in_each_array() -> None:
-    """A zero has a sign of its own."""
+    """Zero counts as a separate sign."""
     theirs = {"a": [1.0, -2.0, 0.0], "b": [3.0, 4.0, 5.0]}
     sides = pair({"a": [1.0, 2.0, 1.0], "b": [3.0, -4.0, 5.0]}, theirs)
     row = compare_signs("layer", "signs", "bfloat16", *sides, LOOSE)
@@ -90,7 +90,7 @@ def test_noise_is_measured_by_what_cancels() -> None:
     assert not row_of(ours, theirs).passed
     row = row_of(ours, theirs, {"dead": "alive"})
     assert row.passed
-    # The larger of the two against what cancels, not their difference.
+    # The larger of the two relative to the terms that cancel, not their difference.
     assert row.relative == pytest.approx(2e-3 / 4)
     assert not row_of({**ours, "dead": [3.0]}, theirs, {"dead": "alive"}).passed
 
@@ -139,15 +139,15 @@ def test_a_rotated_descriptor_misses() -> None:
     row = row_of({"a": [1.0]}, {"a": [1.0]})
     theirs = np.array([[0.6, 0.8], [1.0, 0.0]])
     loose, strict = (dataclasses.replace(row, tolerance=bound) for bound in (0.11, 0.05))
-    # cos(0.1) = 1 - 0.1^2 / 2 + 0.1^4 / 24; a square of 0.0121 lets it pass, one of 0.0025 not.
+    # cos(0.1) = 1 - 0.1^2 / 2 + 0.1^4 / 24; a square of 0.0121 passes, 0.0025 does not.
     turned = np.array([[0.6, 0.8], [math.cos(0.1), math.sin(0.1)]])
     found = cosine_row(strict, turned, theirs)
     assert found.relative == pytest.approx(0.0049958, rel=1e-4)
     assert found.tolerance == pytest.approx(0.0025)
     assert not found.passed
     assert cosine_row(loose, turned, theirs).passed
-    assert cosine_row(strict, 3 * theirs, theirs).passed  # direction alone counts
-    # In float64 a square of 1e-28 is below what a sum of 1 can tell, and the reason says so.
+    assert cosine_row(strict, 3 * theirs, theirs).passed  # only the direction counts
+    # In float64 a square of 1e-28 is below the resolution of a sum of 1, as the reason says.
     exact = dataclasses.replace(row, tolerance=1e-14)
     found = cosine_row(exact, theirs, theirs)
     assert (found.tolerance, found.passed) == (1e-15, True)

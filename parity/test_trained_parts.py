@@ -1,7 +1,7 @@
-"""What trains over DINOv2: BoQ with its last block, EDTformer with its side adapters.
+"""Compare partially trained models over DINOv2: BoQ's last block, EDTformer's side adapters.
 
-Descriptors, and the gradients of that part alone, beside torch, where the rest is frozen too. In
-float64 both sides agree but for some hundred roundings of 1e-16; a gradient that runs through a
+Descriptors, and the gradients of only that part, are compared with torch, with the rest frozen. In
+float64 both sides agree up to some hundred roundings of 1e-16; a gradient that runs through a
 frozen block, or stops at one that trains, is wrong by its own size.
 """
 
@@ -27,7 +27,7 @@ from parity.reference.edtformer import EdtFormer
 from parity.reference.model import Crisalad
 
 BOUND = 1e-11
-"""Three thousand times what float64 makes here, 3e-15; float32 would make 1e-7."""
+"""Three thousand times the float64 error here, 3e-15; the float32 error would be 1e-7."""
 SIZE = (42, 56)
 
 
@@ -58,7 +58,7 @@ TRAINED = {
     "last-1-blocks,norm,head": ("backbone.norm.", "backbone.blocks.1."),
     "adapters,head": ("backbone.adapters.",),
 }
-"""The part of the backbone that trains. Of BoQ the last norm has no gradient: it is not used."""
+"""The part of the backbone that trains. BoQ doesn't use the last norm, so it has no gradient."""
 
 
 @pytest.mark.parametrize("name", MODELS)

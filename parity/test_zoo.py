@@ -1,8 +1,9 @@
-"""Published models against the outputs of their public code, at full size on random weights.
+"""Compare published models with the outputs of their public code, at full size, random weights.
 
-The bound on descriptors, 2e-5 of their norm, is forty times what float32 makes here; a wrong mean,
-axis or norm shows at 1e-3 and more. Images have the model's size already: how photographs are
-resized is held by tests/checkpoints/test_published.py, the filters by tests/data/test_resize.py.
+The bound on descriptors, 2e-5 of their norm, is forty times the float32 error here; a wrong mean,
+axis or norm shows at 1e-3 and more. Images already have the model's size: the resizing of
+photographs is tested in tests/checkpoints/test_published.py, the filters in
+tests/data/test_resize.py.
 """
 
 import dataclasses
@@ -72,7 +73,7 @@ LAYOUTS = {
 }
 
 QUICK = ("cosplace_resnet18_512", "transvpr")
-"""Enough for the test command: full-size models take ten seconds and more each."""
+"""Models for the default tests; each full-size model takes more than ten seconds."""
 
 
 def test_every_golden_is_compared() -> None:
@@ -87,7 +88,7 @@ def compare(found: jax.Array, expected: np.ndarray, bound: float = BOUND) -> Non
 def sampled(
     patches: jax.Array, grid: tuple[int, int], golden: dict[str, np.ndarray]
 ) -> tuple[jax.Array, np.ndarray]:
-    """The patches that the golden file keeps of the backbone's map: every n-th channel and row."""
+    """Select the patches stored in the golden file: every n-th channel and row of the map."""
     expected = np.moveaxis(golden["features"], 1, -1)
     maps = patches.reshape(-1, *grid, patches.shape[-1])
     rows, columns, channels = (
@@ -119,10 +120,10 @@ def test_descriptors_are_the_public_codes(name: str) -> None:
     expected = expected_of(name)
     compare(found, expected, tolerance_of(name).value)
     if "bits" in golden:
-        # 4 to 7 differ, of numbers that are near 0; two images differ in a thousand and more.
+        # 4 to 7 bits differ, where values are near 0; two images differ in more than a thousand.
         bits = np.unpackbits(np.packbits(found > 0, axis=1) ^ golden["bits"], axis=1)
         assert bits.sum(axis=1).max() < 20
-    # Another image's descriptor is far: the bound tells images apart.
+    # Another image's descriptor is far away, so the bound separates images.
     assert np.linalg.norm(expected - expected[::-1]) > 1e-2
 
 
@@ -172,7 +173,7 @@ def sage(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Arr
 
 
 def recalibrated(params: Crisalad, config: Any) -> jax.Array:
-    """The tokens after the first block with a power, of the golden file's images."""
+    """Compute the tokens after the first block with a power, for the golden images."""
     images = zoo.golden("sage_vitb14")["images"]
     prepare = functools.partial(normalise, how=config.preprocessing)
     pixels = jax.vmap(prepare)(jnp.asarray(images))
@@ -187,7 +188,7 @@ def tetra(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Ar
 
 
 def selavprpp(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Array]:
-    """The bits of the branch that the model describes by, and steps of the one that ranks again."""
+    """Compute the bits of the describing branch, and steps of the re-ranking branch."""
     images, own = zoo.golden("selavprpp_base_rerank")["images"], params.aggregator.real
     hashed = features.patches
     real = dataclasses.replace(params, aggregator=own)
@@ -207,7 +208,7 @@ def selavprpp(params: Crisalad, features: Features, config: Any) -> dict[str, ja
 
 
 def side_update(params: Crisalad, images: np.ndarray, config: Any) -> jax.Array:
-    """What the first block's adapter adds to its path, which starts from the same tokens."""
+    """Compute what the first block's adapter adds to its path, from the same tokens."""
     prepare = functools.partial(normalise, how=config.preprocessing)
     tokens = embed(params.backbone, jax.vmap(prepare)(jnp.asarray(images)), config.backbone)
     grid = config.backbone.grid(images.shape[1:3])
@@ -230,7 +231,7 @@ STEPS: dict[str, Callable[[Crisalad, Features, Any], dict[str, jax.Array]]] = {
     "selavprpp_base_rerank": selavprpp,
     "vladbuff_192_wpca4096": vladbuff,
 }
-"""Functions from a backbone's features to what the golden files have on the way."""
+"""Functions from a backbone's features to the intermediate values in the golden files."""
 
 
 @pytest.mark.slow
@@ -246,8 +247,8 @@ def test_steps_are_the_public_codes(name: str) -> None:
     compared |= {"features"} if golden["features"].ndim == 4 else set()
     assert found.keys() == golden.keys() - compared
     for key, array in found.items():
-        # SAGE's power jumps by 2e-3 at 0, where rounding decides the sign: of the class token,
-        # float64 is 7e-5 from float32 here and 5e-5 from the public code's.
+        # SAGE's power jumps by 2e-3 at 0, where rounding decides the sign: for the class token,
+        # float64 differs by 7e-5 from float32 here and by 5e-5 from the public code.
         bound = 3e-4 if key == "cls" else BOUND
         compare(array, golden[key], 3e-2 if name in ROUNDED else bound)
 
@@ -255,7 +256,7 @@ def test_steps_are_the_public_codes(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", ["base", "large"])
 def test_the_float_model_has_the_weights_of_the_model_with_bits(size: str) -> None:
-    """Read by the names of its own file."""
+    """The weights are read by the names in its own file."""
     name, golden = f"selavprpp_{size}", zoo.golden(f"selavprpp_{size}_rerank")
     state = zoo.random_state(name)
     layout, config = infer(state, source=name)
@@ -269,9 +270,9 @@ def test_the_float_model_has_the_weights_of_the_model_with_bits(size: str) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in LAYOUTS if name.startswith("patchnetvlad")])
 def test_windows_are_the_public_codes(name: str) -> None:
-    """Stored in float16, which leaves 2e-4 of their norm.
+    """Windows are stored in float16, with an error of 2e-4 of their norm.
 
-    The public code's float32 sums over whole images leave up to 1.4e-4 at side 2. Descriptors of
+    The public code's float32 sums over whole images have an error of up to 1.4e-4 at side 2. Descriptors of
     neighbouring windows differ by 0.2 and more.
     """
     state, golden = zoo.random_state(name), zoo.golden(name)
@@ -307,8 +308,8 @@ def test_fols_pairs_are_the_public_codes(name: str) -> None:
     compare(features.class_attention, golden["attention"])
     plan = config.aggregator.plan(params.aggregator, features)
     confidences = jax.vmap(fol.confidence)(plan)
-    # A softmax of numbers of 0.004 is near 1 over their count. What is left without that is a
-    # thousandth of it, of which float32's 6e-8 are 1e-4.
+    # A softmax of values around 0.004 is close to 1 over their count. The remainder is a thousandth
+    # of that, and float32's 6e-8 are 1e-4 of the remainder.
     even = 1 / confidences.shape[1]
     compare(jax.nn.softmax(confidences) - even, golden["confidence"] - even, 5e-4)
 
@@ -317,18 +318,18 @@ def test_fols_pairs_are_the_public_codes(name: str) -> None:
     chosen = jax.lax.top_k(confidences, fol.CHOSEN)[1]
     mask = np.zeros(confidences.shape, bool)
     np.put_along_axis(mask, np.asarray(chosen), True, axis=1)
-    # The 225th and 226th differ by 9e-7 of them in one image of ViT-L: a rounding may swap them.
+    # The 225th and 226th differ by 9e-7 in one image of ViT-L, so rounding may swap them.
     same = (mask.reshape(golden["mask"].shape) == golden["mask"]).all(axis=(1, 2))
     assert same.all() or (same.any() and name == "fol_vitl14")
     counts = np.asarray((found != 0).any(axis=-1).sum(axis=-1))
     np.testing.assert_array_equal(counts[same], golden["counts"][same])
-    # The public code's room for features is 3,500 at this size.
+    # The public code has space for 3,500 features at this size.
     compare(found[same, :3500:24, ::4], golden["local"][same])
 
     stored = fol.describe(params, golden["images"], config)
     assert stored.shape[1:] == fol.shape(config)
     scores = np.stack([fol.count_matches(each, stored, config) for each in stored])
-    # In float16 a feature is within 5e-4, and few are that near to another match.
+    # In float16 a feature is accurate to 5e-4, and few are that close to another match.
     np.testing.assert_allclose(scores, golden["scores"], atol=0 if same.all() else 40)
 
 
@@ -346,14 +347,14 @@ def test_anylocs_facets_are_the_public_codes(facet: str) -> None:
 
     patches = unit_features(params, golden["images"], config)
     compare(patches[:, ::4, ::8], golden[f"features{suffix}"])
-    # The smallest gap of cosines between a patch's two nearest words is 4e-6, ten times what
-    # float32 makes here.
+    # The smallest gap in cosine between a patch's two nearest words is 4e-6, ten times the float32
+    # error here.
     found = nearest_words(params.aggregator.words, patches, "cosine")
     np.testing.assert_array_equal(found, golden[f"labels{suffix}"])
     step = 1 if facet == "value" else 8
     descriptors = describe(params, golden["images"], config)
     compare(descriptors[:, ::step], golden[f"descriptor{suffix}"])
-    # By the distance, many patches have another word.
+    # By distance, many patches are assigned to another word.
     euclidean = nearest_words(params.aggregator.words, patches, "euclidean")
     assert (euclidean != found).any()
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets up what is missing and runs the demo: no data and no accelerator needed.
+# Sets up what is missing and runs the demo. It needs no data and no accelerator.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source scripts/environment.sh "[all]"

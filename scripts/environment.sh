@@ -1,5 +1,5 @@
-# Sourced by the other scripts from the repository's root: makes .venv once, installs the package
-# into it with the given extras, and activates it. PYTHON chooses the interpreter.
+# Sourced by the other scripts from the repository root: creates .venv once, installs the package
+# into it with the given extras, and activates it. PYTHON selects the interpreter.
 extras="$1"
 if [ ! -x .venv/bin/python ]; then
   "${PYTHON:-python3}" -m venv .venv
@@ -8,9 +8,9 @@ fi
 source .venv/bin/activate
 stamp=".venv/installed${extras}"
 if [ ! -f "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
-  echo "Installing crisalad-jax${extras} into .venv; the first time takes some minutes." >&2
-  # Torch first, by itself: its exact version may be at hand as a smaller CPU build.
-  # Modules are compiled when they are first imported; most are never imported.
+  echo "Installing crisalad-jax${extras} into .venv; the first time takes a few minutes." >&2
+  # Torch comes first, separately, because its exact version may be available as a smaller CPU build.
+  # Modules are compiled at first import; most are never imported.
   install=(python -m pip install --quiet --no-compile)
   case "$extras" in *dev*) "${install[@]}" "$(grep -o 'torch==[0-9.]*' pyproject.toml)" ;; esac
   "${install[@]}" --editable ".${extras}"

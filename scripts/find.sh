@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Sets up what is missing, makes a map of a folder of photographs, and asks it about one of them or
-# about another. Without a folder it draws some places to try it on. No weights to download.
+# Sets up what is missing, makes a map of a folder of photographs, and queries it with one of them or
+# with another. Without a folder it renders some places to try it on. It downloads no weights.
 set -euo pipefail
 usage="usage: bash scripts/find.sh [FOLDER [PHOTOGRAPH]]"
 stop() { echo "$1; $usage" >&2; exit 2; }
@@ -14,17 +14,17 @@ photograph=""
 cd "$(dirname "$0")/.."
 source scripts/environment.sh "[maps,report]"
 if [ $# -eq 0 ]; then
-  echo "No folder given: drawing 96 places to try it on. $usage" >&2
+  echo "No folder given: rendering 96 places to try it on. $usage" >&2
   crisalad render --out found/world --scenes 1 --test-scenes 24
   images="$PWD/found/world/test/images/test/database"
   photograph="$PWD/found/world/test/images/test/queries"
 fi
-# A map for each folder, of two with the same name, too, and for each version of the model.
+# One map for each folder, even if two have the same name, and for each version of the model.
 key="$(cat crisalad_jax/checkpoints/starter.safetensors - <<<"$images" | cksum | cut -d " " -f 1)"
 map="$PWD/found/$(basename -- "$images")-$key.map"
 crisalad index --images "$images" --out "$map" --on-bad-image skip
 if [ -z "$photograph" ]; then
-  echo "No photograph given: asking about the folder's first, which will find itself first." >&2
+  echo "No photograph given: querying with the first of the folder, which will find itself first." >&2
   photograph="$(python -c 'import sys
 from crisalad_jax.retrieval.maps.map import Map
 with Map.open(sys.argv[2]) as places:

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Runs the notebooks of the documentation anew, over a demo, and keeps what they show.
+# Runs the notebooks of the documentation again, on a demo, and stores their output.
 #
 #     bash scripts/notebooks.sh [DEMO]
 #
-# DEMO is a folder that `crisalad demo` made; without it one is made, which takes minutes.
+# DEMO is a folder made by `crisalad demo`; without it, one is made, which takes minutes.
 set -euo pipefail
 demo=${1:+$(realpath "$1")}
 cd "$(dirname "$0")/.."

@@ -1,13 +1,13 @@
-"""Plant faults in the package, one at a time, and see which of them the nearest tests notice.
+"""Plant faults in the package, one at a time, and check which of them the nearest tests catch.
 
     python scripts/plant_faults.py crisalad_jax/training/losses crisalad_jax/sinkhorn.py
         [--faults 5] [--seed 0] [--workers 2] [--out faults.json]
 
-A fault is one change that a careless author could make: a comparison or a sign turned, a number or
-a truth value changed, a condition, a check, a keyword or a slice left out. Of every file a few are
-drawn, and each is planted in a copy of the project, where the module's own quick tests run until
-one fails. Those that no test noticed are printed: each is a missing assertion, or a change that
-means the same.
+A fault is one change that a careless author could make: a comparison or a sign reversed, a number
+or a boolean changed, a condition, a check, a keyword or a slice left out. A few are drawn for every
+file, and each is planted in a copy of the project, where the module's quick tests run until one
+fails. Faults that no test catches are printed: each is a missing assertion, or an equivalent
+change.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from collections.abc import Iterator, Sequence
 
 ROOT = pathlib.Path(__file__).parent.parent
 LIBRARIES = ["jax", "jax.numpy", "numpy", "scipy.optimize", "torch", "cv2", "pytest", "optax"]
-"""What tests import and no fault changes: loaded once, in the process that the others fork from."""
+"""Libraries that tests import and no fault changes, loaded once before the workers fork."""
 
 OTHER = {
     ast.Lt: ast.LtE,
@@ -59,11 +59,11 @@ NAMES = {"min": "max", "max": "min", "sum": "mean", "sorted": "list", "any": "al
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """One change of a file."""
+    """One change to a file."""
 
     line: int
     start: int
-    """Offset into the file, in bytes; `end` is behind the last."""
+    """Offset into the file in bytes; `end` is exclusive."""
     end: int
     before: str
     after: str
@@ -71,7 +71,7 @@ class Fault:
 
 @dataclasses.dataclass
 class Outcome:
-    """What became of a fault."""
+    """The result of running tests with a fault."""
 
     file: str
     line: int
@@ -83,7 +83,7 @@ class Outcome:
 
 
 def faults_of(source: str) -> list[Fault]:
-    """List every fault that can be planted in a file, in its order.
+    """List every fault that can be planted in a file, in order of position.
 
     Messages, annotations, docstrings and f-strings are left alone.
     """
@@ -105,7 +105,7 @@ def faults_of(source: str) -> list[Fault]:
 
 
 def _code(node: ast.AST) -> Iterator[ast.stmt | ast.expr]:
-    """Walk what runs."""
+    """Walk the nodes that are executed."""
     if isinstance(node, ast.JoinedStr | ast.Raise):
         return
     if isinstance(node, ast.stmt | ast.expr):
@@ -173,17 +173,18 @@ def _changes(node: ast.stmt | ast.expr) -> Iterator[ast.AST]:
 
 
 def draw(faults: Sequence[Fault], count: int, seed: str) -> list[Fault]:
-    """Draw some of a file's faults, no two of a line."""
+    """Draw some of a file's faults, at most one per line."""
     shuffled = random.Random(seed).sample(faults, len(faults))
     of_lines = {fault.line: fault for fault in shuffled}
     return sorted(list(of_lines.values())[:count], key=lambda fault: fault.line)
 
 
 def nearest_tests(file: pathlib.Path) -> list[str]:
-    """List the test files of a module.
+    """List the test files of a module, starting with those that import it.
 
-    Of one in a folder of its room, they are the folder's; else those of its room that import it;
-    else any that do; else its room's. Those come first that import it.
+    For a module in a subfolder of a top-level package, these are the tests of the subfolder;
+    otherwise those tests of the package that import it; otherwise any that import it; otherwise all
+    tests of the package.
     """
     module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
     package, _, name = module.rpartition(".")
@@ -232,10 +233,10 @@ def _run(
 
 
 class Copies:
-    """Copies of the project, one for each worker."""
+    """Copies of the project, one per worker."""
 
     def __init__(self, folder: pathlib.Path, count: int) -> None:
-        """Copy the files that git knows, as they are now."""
+        """Copy the files that git tracks, in their current state."""
         names = subprocess.check_output(["git", "ls-files", "-z"], cwd=ROOT, text=True).split("\0")
         self._free: queue.Queue[pathlib.Path] = queue.Queue()
         for number in range(count):
@@ -247,7 +248,7 @@ class Copies:
             if (ROOT.parent / "shared").is_dir():  # photographs that some tests read
                 (root.parent / "shared").symlink_to(ROOT.parent / "shared")
             self._free.put(root)
-        # What compiles to the same program as before is not compiled again.
+        # Unchanged programs are not compiled again.
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder / "programs")
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
         self._context = multiprocessing.get_context("forkserver")
@@ -256,10 +257,10 @@ class Copies:
     def run(
         self, file: pathlib.Path, fault: Fault | None, tests: Sequence[str], limit: float
     ) -> tuple[str | None, float]:
-        """Plant a fault, run tests, and take it out.
+        """Plant a fault, run tests, and remove it again.
 
         Returns:
-            The first test that failed, "timeout" or None; and the seconds it took.
+            The first test that failed, "timeout" or None; and the seconds that it took.
         """
         root = self._free.get()
         path, started = root / file, time.monotonic()
@@ -287,7 +288,7 @@ class Copies:
 
 
 def _write(path: pathlib.Path, text: bytes) -> None:
-    """Write a module, and leave no compiled one that could pass for it."""
+    """Write a module, and remove compiled files that could be used in its place."""
     path.write_bytes(text)
     for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
         with contextlib.suppress(FileNotFoundError):
@@ -297,8 +298,8 @@ def _write(path: pathlib.Path, text: bytes) -> None:
 def main() -> None:
     """Plant, run, print and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("paths", nargs="+", type=pathlib.Path, help="modules, or folders of them")
-    parser.add_argument("--faults", type=int, default=5, help="at most, of a file")
+    parser.add_argument("paths", nargs="+", type=pathlib.Path, help="modules or folders of modules")
+    parser.add_argument("--faults", type=int, default=5, help="maximum number per file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("faults.json"))
@@ -345,7 +346,7 @@ def main() -> None:
                 print(f"{place}: {found.before}  ->  {found.after}", flush=True)
             print(f"{number}/{len(work)}", end="\r", file=sys.stderr, flush=True)
     seen = sum(found.seen_by is not None for found in outcomes)
-    print(f"{seen} of {len(outcomes)} faults seen")
+    print(f"{seen} of {len(outcomes)} faults caught")
 
 
 if __name__ == "__main__":

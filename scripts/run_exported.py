@@ -1,11 +1,11 @@
-"""Describe a folder of images by what `crisalad export` wrote, without crisalad_jax.
+"""Describe a folder of images with the output of `crisalad export`, without crisalad_jax.
 
     python scripts/run_exported.py EXPORT --images FOLDER --out descriptors.npy [--batch-size 16]
 
-Of format stablehlo. Needs jax, flatbuffers, numpy, Pillow, and safetensors where the weights lie
-beside the program. Row i of the array is the image of line i of the file of names beside it
-(.names.txt). All that it needs to know is in EXPORT/manifest.json: take from here what a program of
-your own needs.
+The export must have the format stablehlo. It needs jax, flatbuffers, numpy, Pillow, and safetensors
+if the weights are in a separate file next to the program. Row i of the array belongs to the image
+in line i of the file of names next to it (.names.txt). Everything else is read from
+EXPORT/manifest.json: copy from here what your own program needs.
 """
 
 import argparse
@@ -28,7 +28,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 
 
 def read_whole(folder: pathlib.Path, entry: dict[str, Any]) -> bytes:
-    """A file of the export, which must be the one that its manifest tells of."""
+    """Read a file of the export, and check it against its manifest entry."""
     data = (folder / entry["file"]).read_bytes()
     if hashlib.sha256(data).hexdigest() != entry["sha256"]:
         raise SystemExit(f"{folder / entry['file']}: found other bytes than manifest.json says")
@@ -36,7 +36,7 @@ def read_whole(folder: pathlib.Path, entry: dict[str, Any]) -> bytes:
 
 
 def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
-    """The manifest, whose checksum is that of its bytes with zeros in the checksum's place."""
+    """Read the manifest; its checksum covers its bytes with zeros in place of the checksum."""
     path = folder / "manifest.json"
     data = path.read_bytes()
     manifest = json.loads(data)
@@ -53,7 +53,7 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def load(folder: pathlib.Path, manifest: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
-    """The function of images (batch, height, width, 3), of the manifest's type, to descriptors."""
+    """Load the function from images (batch, height, width, 3), of the manifest's type, to descriptors."""
     program = jax.export.deserialize(bytearray(read_whole(folder, manifest["program"])))
     if manifest["weights"] is None:
         return lambda images: np.asarray(program.call(images))
@@ -65,7 +65,7 @@ def load(folder: pathlib.Path, manifest: dict[str, Any]) -> Callable[[np.ndarray
 
 
 def read_image(path: pathlib.Path, manifest: dict[str, Any]) -> np.ndarray:
-    """RGB pixels, upright, resized and, where they are floats, normalised as the manifest says."""
+    """Read upright RGB pixels, resized and, if floats, normalised as the manifest says."""
     how, wanted = manifest["model"]["preprocessing"], manifest["images"]
     if how["filter"] not in FILTERS or not how["antialias"] or how["bit_depth"] != "high-byte":
         raise SystemExit(f"found images resized {wanted['resize']}, which Pillow cannot do")
@@ -74,7 +74,7 @@ def read_image(path: pathlib.Path, manifest: dict[str, Any]) -> np.ndarray:
     if how["pixels"] == "floats":
         pixels = pixels.astype(np.float32)
     pixels = resize(pixels, tuple(manifest["model"]["image_size"]), FILTERS[how["filter"]])
-    # A model that rounds sides to its patches resizes once more.
+    # A model that rounds sides to multiples of its patches resizes once more.
     pixels = resize(pixels, tuple(wanted["shape"][1:3]), FILTERS["bilinear"])
     if wanted["dtype"] == "uint8":
         return pixels
@@ -82,7 +82,7 @@ def read_image(path: pathlib.Path, manifest: dict[str, Any]) -> np.ndarray:
 
 
 def resize(pixels: np.ndarray, size: tuple[int, int], resample: Any) -> np.ndarray:
-    """Pixels (height, width, 3) at another size: bytes together, floats channel by channel."""
+    """Resize pixels (height, width, 3): bytes together, floats channel by channel."""
     height, width = size
     if pixels.shape[:2] == size:
         return pixels
@@ -95,13 +95,13 @@ def resize(pixels: np.ndarray, size: tuple[int, int], resample: Any) -> np.ndarr
 def batches(
     paths: list[pathlib.Path], manifest: dict[str, Any], batch_size: int
 ) -> Iterator[tuple[np.ndarray, int]]:
-    """Images of so many files at a time, and how many of them count."""
+    """Yield batches of images, and how many of each batch are not padding."""
     fixed = manifest["images"]["shape"][0]
     size = fixed if isinstance(fixed, int) else batch_size
     if size == fixed and manifest["grouping"] == "batch" and len(paths) % size:
         raise SystemExit(
-            f"found {len(paths)} images, expected a multiple of {size}: this program takes so many "
-            "at a time, and lets them look at each other"
+            f"found {len(paths)} images, expected a multiple of {size}: this program takes that "
+            "many at a time, and they attend to each other"
         )
     for start in range(0, len(paths), size):
         images = np.stack([read_image(p, manifest) for p in paths[start : start + size]])
@@ -130,7 +130,7 @@ def main() -> None:
     np.save(given.out, np.concatenate(parts))
     listed = "".join(f"{name}\n" for name in names)
     given.out.with_suffix(".names.txt").write_text(listed, encoding="utf-8")
-    print(f"{given.out}: {len(names)} descriptors of {parts[0].shape[1]} numbers")
+    print(f"{given.out}: {len(names)} descriptors of {parts[0].shape[1]} dimensions")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Make the model in the package of a run's weights: whiten its channels, and store it in half.
+"""Make the packaged model from a run's weights: whiten its channels, and store it in float16.
 
     python scripts/starter.py RUN/last.safetensors WORLD/train
 
-It writes crisalad_jax/checkpoints/starter.safetensors, and parity/goldens/starter.npz: what the
-model says of two pictures, for other machines to compare. Commit both.
+It writes crisalad_jax/checkpoints/starter.safetensors, and parity/goldens/starter.npz with the
+model's output for two pictures, for comparison on other machines. Commit both.
 """
 
 import argparse
@@ -25,15 +25,15 @@ from crisalad_jax.utils.files import atomic_path
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "parity" / "goldens" / "starter.npz"
 SIZE = (192, 256)
-"""Of images; docs/starter.md has the recalls at others."""
+"""Image size; docs/starter.md has the recalls at other sizes."""
 SAMPLES = 2000
 
 
 def whitened(model: Model, descriptors: np.ndarray) -> Model:
-    """Whiten the channels of Conv-AP, without a mean: a change of its linear layer.
+    """Whiten the channels of Conv-AP without a mean, by changing its linear layer.
 
-    The regions' channels have the unit matrix as their second moments afterwards, over all regions
-    of all images. No mean is subtracted, which would have to be that of descriptors of length 1.
+    Afterwards, the second moments of the channels, over all regions of all images, are the identity
+    matrix. No mean is subtracted, because it would have to be that of unit descriptors.
     """
     assert isinstance(model.config.aggregator, ConvApConfig)
     assert isinstance(model.params.aggregator, ConvAp)
@@ -41,7 +41,7 @@ def whitened(model: Model, descriptors: np.ndarray) -> Model:
     rows = descriptors.astype(np.float64).reshape(len(descriptors), channels, -1)
     rows = rows.transpose(0, 2, 1).reshape(-1, channels)
     values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    turn = vectors * np.sqrt(values.mean() / values)  # the mean keeps weights in half's range
+    turn = vectors * np.sqrt(values.mean() / values)  # the mean keeps weights in float16's range
     old = model.params.aggregator.channel_pool
     assert old.bias is not None
     weight, bias = (jnp.asarray(np.asarray(x) @ turn, "float32") for x in (old.weight, old.bias))

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Sets up what is missing and makes the model in the package again: renders 24,000 places, trains
-# on them three times, and whitens. About four hours on two cores; the same command resumes.
+# Sets up what is missing and rebuilds the packaged model: renders 24,000 places, trains on them
+# three times, and whitens. It takes about four hours on two cores; the same command resumes.
 set -euo pipefail
 usage="usage: bash scripts/starter.sh [OUT [VAL]]"
 case "${1:-}" in -h | --help) echo "$usage"; exit ;; esac
 [ $# -le 2 ] || { echo "found $# arguments, expected at most 2; $usage" >&2; exit 2; }
 [ $# -lt 2 ] || [ -d "$2" ] || { echo "$2: found no such folder; $usage" >&2; exit 2; }
 out="$(realpath -m -- "${1:-starter}")"
-# A set of photographs chooses the best epoch, or places of the world that were not trained on.
+# VAL selects the best epoch: a set of photographs, or by default rendered places not trained on.
 val="$(realpath -m -- "${2:-$out/world/test}")"
 cd "$(dirname "$0")/.."
 source scripts/environment.sh "[all]"

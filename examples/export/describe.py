@@ -1,4 +1,4 @@
-"""Describe photographs by `crisalad export --format onnx`, with neither JAX nor this package.
+"""Describe photographs with an ONNX model from `crisalad export`, without JAX or this package.
 
 python examples/export/describe.py EXPORT IMAGE... (needs numpy, onnxruntime and Pillow)
 """
@@ -14,7 +14,9 @@ from PIL import Image, ImageOps
 folder, *paths = map(pathlib.Path, sys.argv[1:])
 wanted = json.loads((folder / "manifest.json").read_text())["images"]
 if "bilinear, antialiased, on bytes" not in wanted["resize"]:
-    sys.exit(f"{folder}: found images resized {wanted['resize']}, which is not done here")
+    sys.exit(
+        f"{folder}: found images resized {wanted['resize']}, which this example does not support"
+    )
 _, height, width, _ = wanted["shape"]
 session = onnxruntime.InferenceSession(folder / "describe.onnx")
 for path in paths:

@@ -1,4 +1,4 @@
-"""A dustbin whose score is a small network of each patch's features.
+"""A dustbin that scores each patch with a small network of its features.
 
 crisalad train ... --plugin examples/plugins/learnt_dustbin.py
     --model.aggregator.dustbin network

@@ -1,4 +1,4 @@
-"""Sinkhorn at an entropic regularisation that is learnt: a step that changes the problem.
+"""Sinkhorn with a learnt entropic regularisation: a step that changes the problem.
 
 crisalad train ... --plugin examples/plugins/learnt_epsilon.py
     --model.aggregator.sinkhorn.step learnt-epsilon
@@ -23,7 +23,7 @@ class LearntEpsilon(cj.sinkhorn.SinkhornStep):
         return {"log_epsilon": jnp.log(jnp.full((), self.start))}
 
     def prepare(self, problem, params):
-        """Divide the scores before anything is solved: every gradient sees it."""
+        """Divide the scores before solving, so that every gradient includes it."""
         kernel = problem.kernel / jnp.exp(params["log_epsilon"])
         return cj.sinkhorn.Problem.of(
             kernel, problem.log_mu, problem.log_nu, problem.row_tau, problem.column_tau

@@ -13,14 +13,14 @@ import crisalad_jax as cj
 @cj.register_step("momentum")
 @dataclasses.dataclass(frozen=True)
 class Momentum(cj.sinkhorn.Step):
-    """Add a share of the last move, `weight` less 1, to Sinkhorn's own; 1 is plain Sinkhorn."""
+    """Adds `weight` - 1 times the last move to Sinkhorn's own; a weight of 1 is plain Sinkhorn."""
 
     entropic: ClassVar[bool] = True
-    """At rest there is no move to add: its fixed point is Sinkhorn's."""
+    """At a fixed point there is no move to add, so its fixed point is Sinkhorn's."""
     weight: float = 1.5
 
     def init(self, problem, params):
-        """Remember no move."""
+        """Start without a last move."""
         return problem.zeros().column
 
     def step(self, problem, potentials, state, iteration):

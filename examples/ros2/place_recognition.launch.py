@@ -1,7 +1,7 @@
 """Start the node: ros2 launch ./place_recognition.launch.py map:=m.map.
 
-Every parameter of the node is an argument. `python` is the Python that has crisalad-jax and sees
-ROS's packages.
+Every parameter of the node is an argument. `python` is an interpreter with crisalad-jax and access
+to ROS's packages.
 """
 
 import pathlib
@@ -23,7 +23,7 @@ ARGUMENTS = {
     "frame_id": "map",
     "position_stddev": "5.0",
 }
-"""Defaults, as YAML; None is for the user to give."""
+"""Defaults as YAML; None means that the user must give a value."""
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -1,16 +1,16 @@
-"""A ROS 2 node that says at which place of a map its camera is.
+"""A ROS 2 node that publishes where on a map its camera is.
 
     python3 place_recognition_node.py --ros-args -p map:=m.map -p image_topic:=/camera/image_raw
 
-It answers the newest image, and counts those that it passes over while it is busy. For each answer
-it publishes, with the stamp of the image:
+It answers the newest image, and counts those that it skips while it is busy. For each answer it
+publishes, with the stamp of the image:
 
 - `~/place` (diagnostic_msgs/DiagnosticArray): the best place's name, whether the place is known,
-  similarity, position, latency, and the number of images passed over; level OK or, of an unknown
+  similarity, position, latency, and the number of skipped images; level OK or, for an unknown
   place, WARN;
-- where the place is known, `~/pose` (geometry_msgs/PoseWithCovarianceStamped) in a map whose
-  positions are in metres, or `~/fix` (sensor_msgs/NavSatFix) in one of degrees. Neither in a map
-  without positions.
+- if the place is known, `~/pose` (geometry_msgs/PoseWithCovarianceStamped) in a map whose
+  positions are in metres, or `~/fix` (sensor_msgs/NavSatFix) in a map with positions in degrees.
+  A map without positions has neither.
 """
 
 import math
@@ -31,18 +31,18 @@ import crisalad_jax as cj
 PARAMETERS = {
     "map": "",  # folder that `crisalad index` wrote
     "image_topic": "/camera/image_raw",  # CompressedImage if it ends with /compressed
-    "min_similarity": math.nan,  # least similarity of a known place; NaN: as `crisalad calibrate`
-    "verify": 0,  # best places that are verified by local features; their images must be there
+    "min_similarity": math.nan,  # lowest similarity of a known place; NaN: as calibrated
+    "verify": 0,  # number of best places to verify by local features; needs their images
     "k": 3,  # places in each message, best first
-    "fps": 0.0,  # most answers a second; 0: as many as the machine can
+    "fps": 0.0,  # maximum answers per second; 0: no limit
     "sequence": "",  # bayes: a filter over the camera's images so far
     "frame_id": "map",  # frame of the map's positions, for ~/pose and ~/fix
     "position_stddev": 5.0,  # metres between a place's position and the camera's
 }
 UNKNOWN = 1e6
-"""Variance of what a place does not say: height, and in a pose the directions."""
+"""Variance of unknown values: height, and the orientation of a pose."""
 LOG_PERIOD = 10.0
-"""Seconds between two lines of the log about latency."""
+"""Seconds between two log lines about latency."""
 
 
 class PlaceRecognition(Node):
@@ -70,7 +70,7 @@ class PlaceRecognition(Node):
         self._ready.wait()  # a model compiles in seconds
         topic = self._value("image_topic")
         kind = CompressedImage if topic.endswith("/compressed") else Image
-        # All images arrive here: those that are passed over are counted, not lost in ROS's queue.
+        # All images arrive here, so that skipped ones are counted and not lost in ROS's queue.
         self.create_subscription(kind, topic, self._take, qos_profile_sensor_data)
         self.create_timer(LOG_PERIOD, self.log)
         self.get_logger().info(f"{len(self._places)} places, waiting for images of {topic}")
@@ -101,7 +101,7 @@ class PlaceRecognition(Node):
                 self._latencies.append(answer.latency_ms)
                 self._publish(answer)
             self.ended.set_result(None)
-        except Exception as error:  # for `main`: a thread's error ends nothing
+        except Exception as error:  # for `main`, because an error in a thread ends nothing
             self.ended.set_exception(error)
         self._ready.set()
 
@@ -153,7 +153,7 @@ class PlaceRecognition(Node):
         self._position.publish(pose)
 
     def log(self) -> None:
-        """Log the latency so far, and the number of images passed over."""
+        """Log the latency so far, and the number of skipped images."""
         self.get_logger().info(cj.latency_words(self._latencies, self._latest.dropped))
 
     def destroy_node(self) -> None:

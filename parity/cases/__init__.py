@@ -1,4 +1,4 @@
-"""What is compared: one list of layers, whole models and training runs, all of them tiny."""
+"""Cases to compare: layers, whole models and training runs, all tiny."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -45,13 +45,13 @@ AGGREGATORS: Mapping[str, Aggregator] = {
     "supervlad": SuperVladConfig(clusters=3, ghosts=2),
     "transvpr": TransVprConfig(levels=2, dim=24),
 }
-"""Tiny ones, by their names."""
+"""Tiny aggregators by name."""
 
 
 def _model(
     kind: Any = "none", *, encoder: int = 0, aggregator: str = "salad", **backbone: Any
 ) -> ModelConfig:
-    # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
+    # With width 64, the multi-resolution adapter's narrow convolutions have 4 channels.
     fields = {"bottleneck": 2.0} if kind == "multi-resolution" else {}
     return ModelConfig(
         image_size=SIZE,
@@ -95,16 +95,16 @@ HEADS = {
     "BoQ": "boq",
     "SuperVLAD": "supervlad",
 }
-"""What they are called in the table."""
+"""Their names in the table."""
 
 
 def normal(*shape: int, scale: float = 1.0) -> Draw:
-    """Draws normal numbers."""
+    """Draw normal numbers."""
     return lambda rng: rng.normal(scale=scale, size=shape).astype(np.float32)
 
 
 def unit(*shape: int) -> Draw:
-    """Draws vectors of length 1 that resemble each other, as descriptors do."""
+    """Draw unit vectors that resemble each other, like descriptors."""
 
     def draw(rng: np.random.Generator) -> np.ndarray:
         vectors = 1 + rng.normal(size=shape)
@@ -114,14 +114,14 @@ def unit(*shape: int) -> Draw:
 
 
 def pixels(*shape: int) -> Draw:
-    """Draws bytes."""
+    """Draw bytes."""
     return lambda rng: rng.integers(0, 256, shape, dtype=np.uint8)
 
 
 def similarities(looks: Sequence[int]) -> Draw:
-    """Draws inner products of images; those that have the same number in `looks` are alike.
+    """Draw inner products of images that look similar if they have the same number in `looks`.
 
-    An image that looks like another place's makes pairs that a miner takes, among those it leaves.
+    An image that looks like another place yields some pairs that a miner selects, and some it skips.
     """
 
     def draw(rng: np.random.Generator) -> np.ndarray:
@@ -134,23 +134,23 @@ def similarities(looks: Sequence[int]) -> Draw:
 
 
 def among(valid: int) -> Draw:
-    """The mask under which the first few images look at each other, others at themselves only."""
+    """Make a mask: the first `valid` images attend to each other, others only to themselves."""
     first = np.arange(BATCH) < valid
     return constant(first[:, None] & first | np.eye(BATCH, dtype=bool))
 
 
 def earlier() -> Draw:
-    """The mask under which an image looks at itself and those before it: not symmetric."""
+    """Make an asymmetric mask: each image attends to itself and to earlier ones."""
     return constant(np.tri(BATCH, dtype=bool))
 
 
 def constant(array: object) -> Draw:
-    """Draws nothing."""
+    """Return a constant instead of a random draw."""
     return lambda _: np.asarray(array)
 
 
 IMAGES = {"images": normal(BATCH, *SIZE, 3)}
-# Of little variance, so that an epsilon inside a layer norm shows.
+# With low variance, so that the epsilon of a layer norm shows.
 TOKENS = {"tokens": normal(BATCH, 1 + PATCHES, 32, scale=0.05)}
 REGISTER_TOKENS = {"tokens": normal(BATCH, 4 + PATCHES, 32, scale=0.05)}
 FEATURES = {"class_token": normal(BATCH, 32), "patches": normal(BATCH, PATCHES, 32)}
@@ -177,7 +177,7 @@ def _position_cases() -> list[Case]:
 
 
 def _sinkhorn_cases() -> list[Case]:
-    # The published 3 and 1.0; to convergence at 100; and at epsilon 0.1 nearly a choice.
+    # The published 3 and 1.0; 100 for convergence; epsilon 0.1 is nearly a hard assignment.
     settings = [(1, 1.0), (3, 1.0), (10, 1.0), (100, 1.0), (3, 0.1), (3, 0.5), (3, 2.0), (10, 0.1)]
     return [
         Case(
@@ -253,7 +253,7 @@ CASES: tuple[Case, ...] = (
         "miner",
         PLAIN,
         parts.MINER,
-        # Of places 1 and 2 one image each strayed; of place 0 none.
+        # One image each of places 1 and 2 is an outlier, none of place 0.
         {"similarities": similarities((0, 0, 0, 1, 1, 2, 2, 2, 3, 3)), "labels": LABELS},
         bfloat16=False,
         exact=True,
@@ -273,7 +273,7 @@ CASES: tuple[Case, ...] = (
             parts.DESCRIPTOR,
             inputs,
             forward="descriptor",
-            # A patch that rounding gives to another word makes another descriptor.
+            # If rounding assigns a patch to another word, the descriptor changes.
             bfloat16=model is not ANYLOC,
             smooth=model in (CLASS_TOKEN, NETVLAD, TRANSVPR),
         )
@@ -303,9 +303,9 @@ RUNS: tuple[Run, ...] = (
 
 
 def checks(precision: str, seed: int) -> dict[str, Callable[[], list[Row]]]:
-    """Everything to do in one precision, by name, in the table's order.
+    """Collect all checks in one precision by name, in the order of the table.
 
-    What is float32 at least in every model has nothing new to say in bfloat16, and is not there.
+    Layers that always compute in float32 or wider are left out in bfloat16.
     """
 
     def of_case(case: Case) -> Callable[[], list[Row]]:

@@ -1,7 +1,7 @@
-"""What is compared in a case: outputs, the gradient of everything, and a step of AdamW.
+"""Compare outputs, all gradients and a step of AdamW in each case.
 
-Both sides hold the same float32 numbers and compute in the same precision. bfloat16 is compared
-with the reference in float64 too: ours may stray no further from it than torch does.
+Both sides hold the same float32 numbers and compute in the same precision. bfloat16 is also
+compared with the reference in float64: our error is at most `TRUTH_FACTOR` times torch's.
 """
 
 import dataclasses
@@ -43,11 +43,12 @@ from parity.reference.model import Crisalad as TorchCrisalad
 LAYOUT = "reference"
 STEPS = 20
 ONE_STEP = OptimiserConfig(learning_rate=1e-2)
-"""A step so long that the rounding of the parameter it is added to is small beside it."""
+"""A step so long that the rounding of the parameter it is added to is small in comparison."""
 SLOPE = 1e-4
-"""Size of the gradients that flow into a case: small, so that AdamW's epsilon of 1e-8 counts.
+"""Size of the gradients that flow into a case: small, so that AdamW's epsilon of 1e-8 matters.
 
-Doubling the epsilon changes the MLP's step by 1.6 %, and by 1e-5, unseen, were this 1.
+Doubling the epsilon changes the MLP's step by 1.6 %; with 1 here, it would change by an undetectable
+1e-5.
 """
 
 Draw = Callable[[np.random.Generator], np.ndarray]
@@ -61,15 +62,15 @@ class Case:
     model: ModelConfig
     part: Part
     inputs: Mapping[str, Draw] = dataclasses.field(default_factory=dict)
-    """How each input is drawn. Real numbers take the precision's type, and have gradients."""
+    """How each input is drawn. Real numbers are cast to the precision's type, and have gradients."""
     forward: str = "layer"
-    """Which tolerance holds for the outputs: "layer" or "descriptor"."""
+    """Tolerance for the outputs: "layer" or "descriptor"."""
     bfloat16: bool = True
-    """False for what is float32 at least in every model."""
+    """False for layers that are float32 or wider in every model."""
     smooth: bool = True
-    """False where a rectifier or clamp may fall to either side in low precision."""
+    """False if a rectifier or clamp may fall on either side in low precision."""
     exact: bool = False
-    """The outputs are choices, without gradients: they must be the same."""
+    """The outputs are discrete choices without gradients, and must be identical."""
 
 
 class Pass(NamedTuple):
@@ -77,12 +78,12 @@ class Pass(NamedTuple):
 
     outputs: Arrays
     parameters: Arrays
-    """By the reference's names; only those that the case uses."""
+    """Gradients by the reference's names; only of parameters that the case uses."""
     inputs: Arrays
 
 
 def check_case(case: Case, precision: str, seed: int) -> list[Row]:
-    """All rows of a case."""
+    """Compute all rows of a case."""
     tolerances = TOLERANCES[precision]
     rng = random(case.name, seed)
     model = build(case.model, precision, rng)
@@ -109,7 +110,7 @@ def check_case(case: Case, precision: str, seed: int) -> list[Row]:
             rows.append(compare(case.name, "gradients", precision, *pair, tolerance, noise=noise))
         if theirs.parameters:
             steps = _check_step(case, precision, model, ours.parameters, theirs.parameters)
-            # Past a kink the gradients of bfloat16 are too far apart for steps along their signs.
+            # After a kink, bfloat16 gradients differ too much for steps along their signs.
             rows += steps if case.smooth or precision != "bfloat16" else steps[:1]
     if precision == "bfloat16":
         exact = build(case.model, "float64", random(case.name, seed))
@@ -119,7 +120,7 @@ def check_case(case: Case, precision: str, seed: int) -> list[Row]:
 
 
 def _with_truth(case: Case, rows: list[Row], ours: Pass, theirs: Pass, truth: Pass) -> list[Row]:
-    """Rows of bfloat16, and those of both sides' errors from the reference in float64."""
+    """Add rows for both sides' errors relative to the float64 reference to those of bfloat16."""
     precision = "bfloat16"
     pair = ours.outputs, theirs.outputs
     added = [compare_truth(case.name, "forward, from float64", precision, *pair, truth.outputs)]
@@ -140,12 +141,12 @@ def _with_truth(case: Case, rows: list[Row], ours: Pass, theirs: Pass, truth: Pa
 
 
 def random(name: str, seed: int) -> np.random.Generator:
-    """Random numbers of one case, whichever others run."""
+    """Make the generator of one case, independent of which others run."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 def build(config: ModelConfig, precision: str, rng: np.random.Generator) -> TorchCrisalad:
-    """The reference with random weights: float32 numbers, in float64 where that is asked."""
+    """Build the reference with random float32 weights, stored in float64 if requested."""
     model = TorchCrisalad(dataclasses.replace(config, compute_dtype=precision))
     shapes = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     state = random_state(shapes, rng)
@@ -154,7 +155,7 @@ def build(config: ModelConfig, precision: str, rng: np.random.Generator) -> Torc
 
 
 def convert(model: TorchCrisalad) -> tuple[Crisalad, dict[str, np.ndarray]]:
-    """Our parameters of a reference model, in arrays of their own, and the extras beside them."""
+    """Convert a reference model to copies of our parameters and of the extras."""
     state = {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
     params, extras = to_params(state, model.config, LAYOUT, source="the torch reference")
     # Copied: torch counts a batch norm's batches in place.
@@ -162,9 +163,9 @@ def convert(model: TorchCrisalad) -> tuple[Crisalad, dict[str, np.ndarray]]:
 
 
 def split(arrays: Arrays) -> dict[str, np.ndarray]:
-    """Joined arrays cut into the parts that have errors of their own.
+    """Split fused arrays into the parts whose errors are compared separately.
 
-    Queries, keys and values; the class token's position and those of the patches.
+    These are queries, keys and values; the class token's position and those of the patches.
     """
     parts: dict[str, np.ndarray] = {}
     for name, array in arrays.items():
@@ -179,11 +180,11 @@ def split(arrays: Arrays) -> dict[str, np.ndarray]:
 
 
 def cancelling(names: Mapping[str, Any]) -> dict[str, str]:
-    """Those whose gradient is 0 but for rounding, each with one that tells its terms' size.
+    """Map names whose gradient is 0 up to rounding to names that give the size of its terms.
 
-    A constant added to a column of scores is absorbed by the column's potential in the transport:
-    so are the dustbin's score and the score network's last bias. A constant added to a row of
-    attention scores is absorbed by the softmax: so is the bias of the keys.
+    The transport absorbs a constant added to a column of scores in the column's potential, and so
+    the dustbin's score and the score network's last bias. The softmax absorbs a constant added to a
+    row of attention scores, and so the bias of the keys.
     """
     partners = {
         "aggregator.dust_bin": "aggregator.score.3.weight",
@@ -204,7 +205,7 @@ def _rounded(array: np.ndarray) -> np.ndarray:
 
 
 def _gradients(ours: Pass, theirs: Pass) -> tuple[Arrays, Arrays]:
-    """Gradients of all that either side uses; 0 where the other does not."""
+    """Collect the gradients of everything that either side uses, 0 on a side that does not use it."""
     mine, other = ({**split(x.parameters), **x.inputs} for x in (ours, theirs))
     names = {**other, **mine}
 
@@ -280,7 +281,7 @@ def _our_pass(
     learnt = dict(model.named_parameters())
     return Pass(
         {name: as_double(output) for name, output in outputs.items()},
-        # A gradient of exactly 0 is of a parameter that the case does not use.
+        # A gradient of exactly 0 belongs to a parameter that the case does not use.
         {name: array for name, array in by_name.items() if name in learnt and array.any()},
         {name: as_double(array) for name, array in of_reals.items()},
     )
@@ -293,13 +294,13 @@ def _check_step(
     our_gradients: Arrays,
     their_gradients: Arrays,
 ) -> list[Row]:
-    """One step from the same start: both sides along the reference's gradient, then each its own.
+    """Compare one step from the same start: along the reference's gradient, then along each side's.
 
-    AdamW's first step is the sign of the gradient, whatever its size. Where a gradient is rounding
-    noise, the two sides' own signs have nothing to do with each other: such elements are left out
-    of the row of the steps along own gradients, and counted in its note. In bfloat16 single ones of
-    the others may still have another sign, which of a small array would be a large part: there that
-    row is of all arrays joined, and another counts such signs in each array.
+    AdamW's first step is the sign of the gradient, whatever its size. If a gradient is rounding
+    noise, the signs on the two sides are unrelated: such elements are left out of the row for steps
+    along own gradients, and counted in its note. In bfloat16, a few of the other elements may still
+    differ in sign, which can be a large part of a small array: there, that row covers all arrays
+    joined, and another row counts the differing signs in each array.
     """
     names = [name for name in their_gradients if name in our_gradients]
     start = {name: model.get_parameter(name).detach().numpy() for name in names}
@@ -311,7 +312,7 @@ def _check_step(
         return jnp.asarray(optax.apply_updates(params, update))
 
     def after(gradients: Arrays) -> dict[str, np.ndarray]:
-        # All arrays joined to one: the step is of each element, and one array compiles faster.
+        # All arrays are joined, because the step is elementwise and one array compiles faster.
         joined = np.concatenate([start[name].ravel() for name in names])
         along = np.concatenate([gradients[name].ravel() for name in names]).astype(joined.dtype)
         sizes = np.cumsum([start[name].size for name in names])[:-1]
@@ -322,7 +323,7 @@ def _check_step(
     theirs = _their_step(start, their_gradients)
     same, own = after(their_gradients), after(our_gradients)
     mine, other = split(our_gradients), split(their_gradients)
-    # An array without gradient, such as positions that a case does not use, would only decay.
+    # An array without a gradient, such as unused positions, would only decay.
     noise = cancelling(theirs)
     compared = [name for name in theirs if name not in noise and other[name].any()]
     tolerances = TOLERANCES[precision]
@@ -370,6 +371,6 @@ def _their_step(start: Arrays, gradients: Arrays) -> dict[str, np.ndarray]:
 
 
 def _told(ours: np.ndarray, theirs: np.ndarray, floor: float) -> np.ndarray:
-    """Where a gradient stands above rounding, or is 0 on both sides."""
+    """Return where a gradient is above rounding noise, or 0 on both sides."""
     size = np.abs(theirs)
     return (size > floor * np.sqrt(np.mean(size**2))) | ((size == 0) & (ours == 0))

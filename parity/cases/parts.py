@@ -1,7 +1,7 @@
-"""Every layer as a pair of functions, ours and the torch reference's, from inputs to outputs.
+"""Every layer as a pair of functions from inputs to outputs: ours and the torch reference's.
 
 Inputs and outputs are dictionaries by name, in our layout: batch first, channels last. The first
-argument is the whole model on either side, so that the gradient of every parameter is at hand.
+argument is the whole model on either side, so that the gradient of every parameter is available.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,16 +36,16 @@ from parity.reference.tokens import Tokens as TorchTokens
 from parity.reference.vit import Features as TorchFeatures
 
 GRID = (3, 4)
-"""Rows and columns of patches wherever a case needs a grid: not square, so axes cannot be mixed."""
+"""Rows and columns of patches for cases with a grid: not square, so that swapped axes show."""
 LOSS = LossConfig(kind=MultiSimilarityConfig(base=0.5))
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""ImageNet's, as torchvision's models publish them: our own constants are what is tested."""
+"""ImageNet's statistics as torchvision publishes them, because our own constants are under test."""
 
 Inputs = Mapping[str, Any]
 
 
 class Part(NamedTuple):
-    """The same computation twice: (whole model, inputs, config) to outputs."""
+    """The same computation on both sides, from (whole model, inputs, config) to outputs."""
 
     ours: Callable[[Crisalad, Inputs, ModelConfig], dict[str, jax.Array]]
     theirs: Callable[[TorchCrisalad, Inputs, ModelConfig], dict[str, Tensor]]
@@ -78,7 +78,7 @@ def _their_pixels(model: TorchCrisalad, x: Inputs, _: ModelConfig) -> dict[str, 
 
 
 def torch_normalise(images: Tensor, dtype: torch.dtype) -> Tensor:
-    """8-bit (..., 3) as torchvision's `to_tensor` and `normalize` do, the channels left last."""
+    """Normalise 8-bit (..., 3) like torchvision's `to_tensor` and `normalize`, with channels last."""
     mean, deviation = (torch.tensor(x, dtype=dtype) for x in (MEAN, DEVIATION))
     return (images.to(dtype) / 255 - mean) / deviation
 
@@ -98,7 +98,7 @@ EMBED = Part(
 
 
 def positions(grid: tuple[int, int]) -> Part:
-    """Position embeddings resized to a grid of patches."""
+    """Make a part that resizes position embeddings to a grid of patches."""
 
     def ours(params: Crisalad, _: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
         resized = interpolate_positions(params.backbone.pos_embed, grid, _vit(config))

@@ -1,7 +1,7 @@
-"""20 steps of training from the same start on the same batches, dropout off.
+"""Compare 20 training steps from the same start on the same batches, without dropout.
 
-Ours is the real `train_step`, fed with bytes in batches of one size, one of them padded; the
-reference is fed with the images that count, normalised by torch.
+Ours is the real `train_step`, with bytes in batches of one size, one of them padded; the reference
+gets only the valid images, normalised by torch.
 """
 
 import dataclasses
@@ -26,15 +26,15 @@ from parity.compare import FROZEN, TOLERANCES, Arrays, Row, as_double, compare
 from parity.reference.training import train
 
 OPTIMISER = OptimiserConfig(learning_rate=1e-3)
-"""Some 15 times the paper's rate, decaying linearly to 0: 20 steps move the parameters visibly."""
+"""About 15 times the paper's rate, decaying linearly to 0, so that 20 steps move the parameters."""
 LABELS = np.array([0, 0, 1, 1, 2, 2], np.int32)
 PADDED_STEP = 5
-"""In which step the last image only pads the batch."""
+"""The step in which the last image is padding."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A model and which of its parameters train."""
+    """A model, and which of its parameters train."""
 
     name: str
     model: ModelConfig
@@ -43,14 +43,14 @@ class Run:
 
 
 class Batch(NamedTuple):
-    """Bytes (image, height, width, 3), and which images count."""
+    """Bytes (image, height, width, 3), and which images are valid."""
 
     images: np.ndarray
     valid: np.ndarray
 
 
 def check_run(run: Run, precision: str, seed: int) -> list[Row]:
-    """Losses at every step, parameters and running statistics at the end, frozen ones unmoved."""
+    """Compare losses, final parameters and running statistics, and check that the rest is frozen."""
     rng = random(run.name, seed)
     model = build(run.model, precision, rng)
     batches = [_batch(run, step, rng) for step in range(STEPS)]
@@ -76,7 +76,7 @@ def check_run(run: Run, precision: str, seed: int) -> list[Row]:
     trained, reference, origin = (
         split({name: state[name] for name in learnt}) for state in (ours, theirs, start)
     )
-    # A batch norm takes its batch's mean away: the gradient of a bias before it is rounding alone.
+    # A batch norm subtracts the batch mean, so the gradient of a bias before it is only rounding.
     absorbed = [name for name in trained if name.endswith(".conv.bias")]
     for name in (*cancelling(trained), *absorbed):
         del trained[name], reference[name], origin[name]
@@ -106,7 +106,7 @@ def check_run(run: Run, precision: str, seed: int) -> list[Row]:
 
 
 def _batch(run: Run, step: int, rng: np.random.Generator) -> Batch:
-    """Images of a place share a picture, under noise of their own."""
+    """Draw a batch in which images of a place share a picture, with independent noise."""
     places = rng.integers(0, 256, (3, *run.size, 3))[LABELS]
     noise = rng.integers(0, 256, places.shape)
     valid = np.ones(len(LABELS), bool)
@@ -121,7 +121,7 @@ def _our_training(
     config: TrainConfig,
     batches: Sequence[Batch],
 ) -> tuple[Arrays, Arrays]:
-    """Losses by step, and the final parameters by the reference's names."""
+    """Train ours; return the losses by step, and the final parameters by the reference's names."""
     step_config = StepConfig(model, config.loss, config.optimiser, STEPS)
     state, frozen = init_train_state(params, config.trainable, step_config)
     labels, key = jnp.asarray(LABELS), jax.random.key(0)

@@ -1,7 +1,7 @@
 """Random weights far from every symmetric start, under the torch reference's names.
 
-Gains away from 1, biases away from 0, up-projections away from 0, batch statistics like those of a
-trained model: a layer that drops or confuses any of them gives other numbers.
+Gains differ from 1, biases and up-projections differ from 0, and batch statistics resemble those of
+a trained model, so a layer that drops or confuses any of them gives different results.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ import numpy as np
 def random_state(
     shapes: Mapping[str, tuple[int, ...]], rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """An array for every name, in float32; counts of batches in int64."""
+    """Draw an array for every name, in float32; batch counts are int64."""
     return {name: _array(name, shape, rng) for name, shape in shapes.items()}
 
 
@@ -21,7 +21,7 @@ def _array(name: str, shape: tuple[int, ...], rng: np.random.Generator) -> np.nd
     if leaf == "num_batches_tracked":
         return np.full(shape, 7, np.int64)
     if leaf == "running_var":
-        # From batch norm's epsilon of 1e-3 to 1: the epsilon counts.
+        # From batch norm's epsilon of 1e-3 to 1, so that the epsilon matters.
         array = 10 ** rng.uniform(-3, 0, shape)
     elif leaf == "p":
         array = rng.uniform(2, 4, shape)

@@ -1,4 +1,4 @@
-"""Multi-head attention, under DINOv2's names of parameters and under torch's."""
+"""Multi-head attention, with DINOv2's parameter names and with torch's."""
 
 import math
 
@@ -10,16 +10,16 @@ from parity.reference.layers import Linear, at_least_float32
 
 
 def attend(qkv: Tensor, heads: int, *, mask: Tensor | None, dropout_rate: float) -> Tensor:
-    """Scaled dot-product attention (Vaswani et al. 2017).
+    """Compute scaled dot-product attention (Vaswani et al. 2017).
 
     Args:
         qkv: (batch, token, 3 dim): queries, keys and values, in this order.
         heads: number of heads.
-        mask: (token, token) of bool: `mask[i, j]` says that token i may look at token j.
+        mask: (token, token) of bool: `mask[i, j]` is whether token i may attend to token j.
         dropout_rate: of the attention weights.
 
     Returns:
-        (batch, token, dim), in the type of `qkv`. Scores and softmax are float32 at least.
+        (batch, token, dim), in the type of `qkv`. Scores and softmax are at least float32.
     """
     # Each (batch, head, token, head_dim).
     queries, keys, values = qkv.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4).unbind()
@@ -32,25 +32,25 @@ def attend(qkv: Tensor, heads: int, *, mask: Tensor | None, dropout_rate: float)
 
 
 class Attention(nn.Module):
-    """DINOv2's: `qkv`, then `proj`."""
+    """DINOv2's attention: `qkv`, then `proj`."""
 
     def __init__(self, dim: int, heads: int) -> None:
-        """`heads` divides the width `dim`."""
+        """Make attention of width `dim`, a multiple of `heads`."""
         super().__init__()
         self.heads = heads
         self.qkv = Linear(dim, 3 * dim)
         self.proj = Linear(dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(batch, token, dim) to the same; all look at all."""
+        """Map (batch, token, dim) to the same shape; all tokens attend to all."""
         return self.proj(attend(self.qkv(x), self.heads, mask=None, dropout_rate=0.0))
 
 
 class MultiheadAttention(nn.Module):
-    """`torch.nn.MultiheadAttention`'s: `in_proj_weight` and `in_proj_bias`, then `out_proj`."""
+    """`torch.nn.MultiheadAttention`: `in_proj_weight` and `in_proj_bias`, then `out_proj`."""
 
     def __init__(self, dim: int, heads: int, dropout: float) -> None:
-        """Start as torch does: Glorot-uniform inputs, zero biases."""
+        """Initialise like torch: Glorot-uniform input projections, zero biases."""
         super().__init__()
         self.heads = heads
         self.dropout = dropout
@@ -60,7 +60,7 @@ class MultiheadAttention(nn.Module):
         nn.init.zeros_(self.out_proj.bias)
 
     def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
-        """(batch, token, dim) to the same; `mask` (token, token) says who may look at whom."""
+        """Map (batch, token, dim) to the same shape, with `mask` (token, token)."""
         qkv = F.linear(x, self.in_proj_weight.to(x.dtype)) + self.in_proj_bias.to(x.dtype)
         rate = self.dropout if self.training else 0.0
         return self.out_proj(attend(qkv, self.heads, mask=mask, dropout_rate=rate))

@@ -29,18 +29,18 @@ OPERATIONS: Mapping[str, Callable[[Image.Image, float], Image.Image]] = {
     "AutoContrast": lambda image, s: ImageOps.autocontrast(image),
     "Equalize": lambda image, s: ImageOps.equalize(image),
 }
-"""By torchvision's names, each of an image and a strength."""
+"""Functions of an image and a strength, by torchvision's names."""
 
 
 class Strength(NamedTuple):
-    """How strong an operation is."""
+    """The strength of an operation."""
 
     value: float
     signed: bool = False
 
 
 def strengths(magnitude: int, width: int, height: int) -> dict[str, Strength]:
-    """Of all operations at a magnitude of `BINS`, from torchvision's table."""
+    """Return the strengths of all operations at a magnitude of `BINS`, from torchvision's table."""
     level = magnitude / (BINS - 1)
     enhancement = Strength(0.9 * level, signed=True)
     return {
@@ -61,7 +61,7 @@ def strengths(magnitude: int, width: int, height: int) -> dict[str, Strength]:
 def rand_augment(
     image: Image.Image, operations: int, magnitude: int, generator: random.Random
 ) -> Image.Image:
-    """Apply so many operations, drawn uniformly with replacement, each of random sign."""
+    """Apply operations drawn uniformly with replacement, each with a random sign."""
     table = strengths(magnitude, *image.size)
     for _ in range(operations):
         name = generator.choice(list(OPERATIONS))

@@ -1,4 +1,4 @@
-"""Bag of queries (Ali-bey et al., CVPR 2024), of torch's own transformer modules."""
+"""Bag of queries (Ali-bey et al., CVPR 2024), built from torch's transformer modules."""
 
 import torch
 from torch import Tensor, nn
@@ -9,10 +9,10 @@ from parity.reference.layers import Conv2d, LayerNorm, Linear, at_least_float32
 
 
 class BoqBlock(nn.Module):
-    """An encoder layer over the patches, and queries that look at each other, then at them."""
+    """An encoder layer over patches, and queries that attend to each other, then to the patches."""
 
     def __init__(self, config: BoqConfig) -> None:
-        """Queries start normal of deviation 1."""
+        """Make a block whose queries start normal with deviation 1."""
         super().__init__()
         width, heads = config.channels, config.heads
         self.encoder = nn.TransformerEncoderLayer(
@@ -25,7 +25,7 @@ class BoqBlock(nn.Module):
         self.norm_out = LayerNorm(width)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(batch, patch, channel) to the same for the next block, and (batch, query, channel)."""
+        """Map (batch, patch, channel) to the next block's input and (batch, query, channel)."""
         x = _cast(self.encoder, x)
         queries = self.queries.to(x.dtype).expand(len(x), -1, -1)
         queries = self.norm_q(queries + _cast(self.self_attn, queries, queries, queries)[0])
@@ -33,10 +33,10 @@ class BoqBlock(nn.Module):
 
 
 class Boq(nn.Module):
-    """Fewer channels, the blocks in order, then rows of all their answers."""
+    """A channel reduction, the blocks in order, then a linear mix of all their outputs."""
 
     def __init__(self, dim: int, config: BoqConfig) -> None:
-        """For feature maps of `dim` channels."""
+        """Make a head for feature maps of `dim` channels."""
         super().__init__()
         self.proj_c = Conv2d(dim, config.channels, 3, padding=1)
         self.norm_input = LayerNorm(config.channels)
@@ -44,7 +44,7 @@ class Boq(nn.Module):
         self.fc = Linear(config.layers * config.queries, config.rows)
 
     def forward(self, patches: Tensor) -> Tensor:
-        """(batch, dim, rows, columns) to (batch, row, channel)."""
+        """Map (batch, dim, rows, columns) to (batch, row, channel)."""
         x = self.norm_input(self.proj_c(patches).flatten(2).mT)
         answers = []
         for block in self.boqs:
@@ -54,6 +54,6 @@ class Boq(nn.Module):
 
 
 def _cast(module: nn.Module, *inputs: Tensor) -> Tensor:
-    """What a module of torch's own makes of its inputs, its parameters in their type."""
+    """Apply a torch module with its parameters cast to the type of the inputs."""
     cast = {name: parameter.to(inputs[0].dtype) for name, parameter in module.named_parameters()}
     return functional_call(module, cast, inputs)

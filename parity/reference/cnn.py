@@ -1,6 +1,6 @@
-"""ResNet (He et al., CVPR 2016) and VGG-16 (Simonyan and Zisserman, ICLR 2015), as torchvision's.
+"""ResNet (He et al., CVPR 2016) and VGG-16 (Simonyan and Zisserman, ICLR 2015), as in torchvision.
 
-Layers have the numbers of a `torch.nn.Sequential` of torchvision's children, as CosPlace's files.
+Layers are numbered like a `torch.nn.Sequential` of torchvision's children, as in CosPlace's files.
 """
 
 from torch import Tensor, nn
@@ -12,7 +12,7 @@ from parity.reference.vit import Features
 
 BLOCKS = {18: (2, 2, 2, 2), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
 VGG_16 = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)
-"""Widths of the convolutions of 3 x 3; 0 is a maximum of 2 x 2."""
+"""Widths of the 3 x 3 convolutions; 0 is a 2 x 2 max pooling."""
 
 
 def _conv(d_in: int, d_out: int, side: int, stride: int = 1) -> Conv2d:
@@ -23,7 +23,7 @@ class Residual(nn.Module):
     """A block of two convolutions, or of three around a bottleneck."""
 
     def __init__(self, d_in: int, width: int, d_out: int, stride: int) -> None:
-        """Three convolutions where `d_out` is not the width."""
+        """Make a block, with three convolutions if `d_out` differs from `width`."""
         super().__init__()
         deep = d_out != width
         self.conv1 = _conv(d_in, width, 1 if deep else 3, 1 if deep else stride)
@@ -40,7 +40,7 @@ class Residual(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(batch, d_in, rows, columns) to (batch, d_out, rows / stride, columns / stride)."""
+        """Map (batch, d_in, rows, columns) to (batch, d_out, rows / stride, columns / stride)."""
         y = self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x)))))
         if hasattr(self, "conv3"):
             y = self.bn3(self.conv3(F.relu(y)))
@@ -48,10 +48,10 @@ class Residual(nn.Module):
 
 
 class ResNet(nn.Sequential):
-    """The first convolution, a maximum, and the stages."""
+    """The first convolution, max pooling, and the stages."""
 
     def __init__(self, config: ResNetConfig) -> None:
-        """As many stages as the configuration keeps."""
+        """Make the stages that the configuration uses."""
         stages, d_in = [], 64
         for stage, count in enumerate(BLOCKS[config.layers][: config.stages]):
             width = 64 * 2**stage
@@ -65,7 +65,7 @@ class ResNet(nn.Sequential):
         super().__init__(*first, *stages)
 
     def forward(self, images: Tensor) -> Features:
-        """(batch, 3, height, width) to the last stage's map; no class token."""
+        """Map (batch, 3, height, width) to the last stage's feature map; no class token."""
         return Features(images.new_zeros(len(images), 0), super().forward(images))
 
 
@@ -73,7 +73,7 @@ class Vgg(nn.Sequential):
     """VGG-16's convolutions; the last has no ReLU."""
 
     def __init__(self) -> None:
-        """Thirteen convolutions."""
+        """Make the thirteen convolutions."""
         layers: list[nn.Module] = []
         d_in = 3
         for width in VGG_16:
@@ -85,5 +85,5 @@ class Vgg(nn.Sequential):
         super().__init__(*layers[:-1])
 
     def forward(self, images: Tensor) -> Features:
-        """(batch, 3, height, width) to the last convolution's map; no class token."""
+        """Map (batch, 3, height, width) to the last convolution's feature map; no class token."""
         return Features(images.new_zeros(len(images), 0), super().forward(images))

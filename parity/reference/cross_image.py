@@ -1,6 +1,6 @@
-"""The cross-image encoder (paper section 3.4): `nn.TransformerEncoder` by hand, across images.
+"""The cross-image encoder (paper section 3.4): an explicit `nn.TransformerEncoder` across images.
 
-Its layers are CricaVPR's: post-norm, exact GELU.
+Its layers are CricaVPR's: post-norm, with exact GELU.
 """
 
 from torch import Tensor, nn
@@ -14,10 +14,10 @@ NORM_EPSILON = 1e-5
 
 
 class EncoderLayer(nn.Module):
-    """Attention and feed-forward network, a layer norm after each."""
+    """Attention and feed-forward network, with a layer norm after each."""
 
     def __init__(self, dim: int, config: CrossImageConfig) -> None:
-        """For tokens of width `dim`."""
+        """Make it for tokens of width `dim`."""
         super().__init__()
         self.self_attn = MultiheadAttention(dim, config.heads, config.dropout)
         self.linear1 = Linear(dim, config.feedforward)
@@ -27,7 +27,7 @@ class EncoderLayer(nn.Module):
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
-        """(image, token, dim) to the same."""
+        """Map (image, token, dim) to the same shape."""
         across = tokens.transpose(0, 1)
         attended = self.self_attn(across, mask).transpose(0, 1)
         tokens = self.norm1(tokens + self.dropout(attended))
@@ -39,14 +39,14 @@ class CrossImageEncoder(nn.Module):
     """The layers, in order."""
 
     def __init__(self, dim: int, config: CrossImageConfig) -> None:
-        """For tokens of width `dim`."""
+        """Make it for tokens of width `dim`."""
         super().__init__()
         self.layers = nn.ModuleList(EncoderLayer(dim, config) for _ in range(config.layers))
 
     def forward(self, tokens: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Each token looks at the same token of the other images: (image, token, dim) to the same.
+        """Let each token attend to the same token of other images, for (image, token, dim).
 
-        `mask[i, j]` says that image i may look at image j; None lets all look at all.
+        `mask[i, j]` is whether image i may attend to image j; None allows all.
         """
         for layer in self.layers:
             tokens = layer(tokens, mask)

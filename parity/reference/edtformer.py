@@ -1,4 +1,4 @@
-"""EDTformer (Jin et al. 2025): side adapters and a decoder, of torch's own attention."""
+"""EDTformer (Jin et al. 2025): side adapters and a decoder, built from torch's attention."""
 
 import torch
 from torch import Tensor, nn
@@ -14,28 +14,28 @@ class SideAdapter(nn.Module):
     """Down, GELU, up."""
 
     def __init__(self, dim: int, width: int) -> None:
-        """From tokens of `dim` to `width` and back."""
+        """Make an adapter for tokens of `dim` with a bottleneck of `width`."""
         super().__init__()
         self.D_fc1 = nn.Linear(dim, width)
         self.D_fc2 = nn.Linear(width, dim)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(batch, token, dim) to the same."""
+        """Map (batch, token, dim) to the same shape."""
         return self.D_fc2(F.gelu(self.D_fc1(tokens)))
 
 
 class SideViT(ViT):
-    """DINOv2 as it is, and a path beside it: z = x + y, then y = z + alpha A(z) for each block."""
+    """Unmodified DINOv2 with a side path: z = x + y, then y = z + alpha A(z) for each block."""
 
     def __init__(self, config: ViTConfig) -> None:
-        """An adapter for each block, none in it."""
+        """Make one adapter for each block, outside the block."""
         super().__init__(config)
         self.alpha = config.adapter.alpha
         width = config.adapter.width(config.dim)
         self.adapters = nn.ModuleList(SideAdapter(config.dim, width) for _ in self.blocks)
 
     def run_blocks(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
-        """(batch, token, dim) to what the path beside the blocks ends in."""
+        """Map (batch, token, dim) to the output of the side path."""
         beside = tokens
         for block, adapter in zip(self.blocks, self.adapters, strict=True):
             tokens = block(tokens, grid)
@@ -45,10 +45,10 @@ class SideViT(ViT):
 
 
 class DecoderLayer(nn.Module):
-    """The queries look at each other, then at the tokens; a norm after each."""
+    """Queries attend to each other, then to the tokens, with a norm after each."""
 
     def __init__(self, width: int, heads: int) -> None:
-        """Both attentions are torch's."""
+        """Make a layer with two of torch's attentions."""
         super().__init__()
         self.self_attn = nn.MultiheadAttention(width, heads, batch_first=True)
         self.multihead_attn = nn.MultiheadAttention(width, heads, batch_first=True)
@@ -56,22 +56,22 @@ class DecoderLayer(nn.Module):
         self.norm2 = nn.LayerNorm(width)
 
     def forward(self, queries: Tensor, tokens: Tensor) -> Tensor:
-        """(batch, query, width) and (batch, token, width) to (batch, query, width)."""
+        """Map (batch, query, width) and (batch, token, width) to (batch, query, width)."""
         queries = self.norm1(queries + self.self_attn(queries, queries, queries)[0])
         return self.norm2(queries + self.multihead_attn(queries, tokens, tokens)[0])
 
 
 class Decoder(nn.Module):
-    """The layers in turn."""
+    """The layers in order."""
 
     def __init__(self, config: EdtFormerConfig) -> None:
-        """So many of them as `config` says."""
+        """Make the number of layers in `config`."""
         super().__init__()
         made = (DecoderLayer(config.width, config.heads) for _ in range(config.layers))
         self.layers = nn.ModuleList(made)
 
     def forward(self, queries: Tensor, tokens: Tensor) -> Tensor:
-        """(batch, query, width) and (batch, token, width) to (batch, query, width)."""
+        """Map (batch, query, width) and (batch, token, width) to (batch, query, width)."""
         for layer in self.layers:
             queries = layer(queries, tokens)
         return queries
@@ -81,7 +81,7 @@ class EdtFormer(nn.Module):
     """The whole model, under the public names."""
 
     def __init__(self, backbone: ViTConfig, head: EdtFormerConfig) -> None:
-        """Random parameters."""
+        """Make a model with random parameters."""
         super().__init__()
         self.queries = nn.Parameter(torch.randn(1, head.queries, head.width))
         self.backbone = SideViT(backbone)
@@ -91,7 +91,7 @@ class EdtFormer(nn.Module):
         self.row_proj = nn.Linear(head.queries, head.rows)
 
     def forward(self, images: Tensor) -> Tensor:
-        """(batch, 3, height, width) to unit descriptors, channel by channel."""
+        """Map (batch, 3, height, width) to unit descriptors, ordered by channel."""
         features = self.backbone(images)
         tokens = [features.class_token[:, None], features.patches.flatten(2).mT]
         tokens = self.fc(torch.cat(tokens, dim=1))

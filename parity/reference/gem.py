@@ -8,22 +8,22 @@ GEM_FLOOR = 1e-6
 
 
 class UnitPatches(nn.Module):
-    """Every patch to length 1, over its channels."""
+    """Normalisation of every patch to length 1 over its channels."""
 
     def forward(self, patches: Tensor) -> Tensor:
-        """(batch, dim, rows, columns) to the same."""
+        """Map (batch, dim, rows, columns) to the same shape."""
         return F.normalize(patches, dim=1)
 
 
 class GeM(nn.Module):
-    """The mean of powers, and its root: one exponent for all channels."""
+    """The root of the mean of powers, with one exponent for all channels."""
 
     def __init__(self) -> None:
-        """The exponent starts at 3."""
+        """Initialise the exponent to 3."""
         super().__init__()
         self.p = nn.Parameter(torch.full((1,), 3.0))
 
     def forward(self, patches: Tensor) -> Tensor:
-        """(batch, dim, rows, columns) to (batch, dim)."""
+        """Map (batch, dim, rows, columns) to (batch, dim)."""
         powers = patches.clamp(min=GEM_FLOOR).pow(self.p)
         return powers.mean(dim=(2, 3)).pow(1 / self.p)

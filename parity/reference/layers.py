@@ -1,4 +1,4 @@
-"""The small layers, each in the type of its input: torch's, whose parameters may be wider."""
+"""Small layers of torch that compute in the type of their input; parameters may be wider."""
 
 import torch
 from torch import Tensor, nn
@@ -6,7 +6,7 @@ from torch.nn import functional as F
 
 
 def at_least_float32(x: Tensor) -> Tensor:
-    """`x` in float32, or in its own type if that is wider: for norms, softmax and transport."""
+    """Cast `x` to float32 unless its type is wider, for norms, softmax and transport."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
@@ -14,8 +14,8 @@ class Linear(nn.Linear):
     """Affine map of the last axis."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., d_in) to (..., d_out)."""
-        # Product and sum are rounded one by one, as in `crisalad_jax`.
+        """Map (..., d_in) to (..., d_out)."""
+        # Product and sum are rounded separately, as in `crisalad_jax`.
         y = F.linear(x, self.weight.to(x.dtype))
         return y if self.bias is None else y + self.bias.to(x.dtype)
 
@@ -24,17 +24,17 @@ class Conv2d(nn.Conv2d):
     """Convolution, with or without bias."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(batch, d_in, height, width) to (batch, d_out, height, width)."""
+        """Map (batch, d_in, height, width) to (batch, d_out, height, width)."""
         weight = self.weight.to(x.dtype)
         y = F.conv2d(x, weight, stride=self.stride, padding=self.padding, groups=self.groups)
         return y if self.bias is None else y + self.bias.to(x.dtype)[:, None, None]
 
 
 class LayerNorm(nn.LayerNorm):
-    """Normalises the last axis, in float32 at least."""
+    """Layer norm of the last axis, in at least float32."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., dim) to (..., dim)."""
+        """Map (..., dim) to the same shape."""
         y = F.layer_norm(
             at_least_float32(x), self.normalized_shape, self.weight, self.bias, self.eps
         )
@@ -42,10 +42,10 @@ class LayerNorm(nn.LayerNorm):
 
 
 class BatchNorm2d(nn.BatchNorm2d):
-    """Batch norm, in float32 at least inside."""
+    """Batch norm that computes in at least float32."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(batch, dim, height, width) to the same."""
+        """Map (batch, dim, height, width) to the same shape."""
         return super().forward(at_least_float32(x)).to(x.dtype)
 
 

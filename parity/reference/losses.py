@@ -1,6 +1,6 @@
 """Multi-similarity loss with online mining (Wang et al., CVPR 2019), as used with GSV-Cities.
 
-There is no `valid` here: images that only pad a batch of `crisalad_jax` are left out instead.
+There is no `valid` here: padding images of a `crisalad_jax` batch are left out instead.
 """
 
 from typing import NamedTuple
@@ -15,14 +15,14 @@ from parity.reference.layers import at_least_float32
 
 
 class MinedPairs(NamedTuple):
-    """Which pairs (anchor, other) enter the loss: two (anchor, image) of bool."""
+    """The pairs (anchor, other) that enter the loss: two boolean arrays (anchor, image)."""
 
     positives: Tensor
     negatives: Tensor
 
 
 class LossResult(NamedTuple):
-    """The loss and what is logged beside it, both ()."""
+    """The loss and the statistic logged with it, both ()."""
 
     loss: Tensor
     easy_anchor_fraction: Tensor
@@ -30,17 +30,17 @@ class LossResult(NamedTuple):
 
 
 def mine(similarities: Tensor, labels: Tensor, *, margin: float) -> MinedPairs:
-    """Pairs that violate the order within their row by less than `margin`, strictly.
+    """Select pairs that violate the order within their row by less than `margin`, strictly.
 
     Args:
         similarities: (anchor, image).
         labels: (image,) of integers.
-        margin: epsilon of the paper.
+        margin: the epsilon of the paper.
     """
     same = labels[:, None] == labels
     positives = same & ~torch.eye(len(labels), dtype=torch.bool, device=labels.device)
     negatives = ~same
-    # An anchor without positives or without negatives compares with infinity, and mines nothing.
+    # An anchor without positives or without negatives is compared with infinity, and mines nothing.
     hardest_negative = similarities.masked_fill(~negatives, -torch.inf).amax(1, keepdim=True)
     hardest_positive = similarities.masked_fill(~positives, torch.inf).amin(1, keepdim=True)
     return MinedPairs(
@@ -50,12 +50,12 @@ def mine(similarities: Tensor, labels: Tensor, *, margin: float) -> MinedPairs:
 
 
 def multi_similarity_loss(descriptors: Tensor, labels: Tensor, config: LossConfig) -> LossResult:
-    """Mean over all anchors of the loss of their mined pairs; the miner passes no gradient.
+    """Compute the mean loss of mined pairs over all anchors; the miner passes no gradient.
 
     Args:
         descriptors: (image, descriptor), unit vectors.
         labels: (image,): the place of each image.
-        config: constants.
+        config: constants of the loss.
     """
     wide = at_least_float32(descriptors)
     similarities = wide @ wide.T
@@ -74,6 +74,6 @@ def multi_similarity_loss(descriptors: Tensor, labels: Tensor, config: LossConfi
 
 
 def _log1p_sum_exp(x: Tensor, where: Tensor) -> Tensor:
-    """log(1 + sum of exp(x) over the chosen), 0 where none is chosen."""
+    """Compute log(1 + sum of exp(x) where selected), which is 0 if nothing is selected."""
     # A column of zeros is the 1 inside the logarithm.
     return F.pad(x.masked_fill(~where, -torch.inf), (0, 1)).logsumexp(dim=1)

@@ -6,10 +6,10 @@ from parity.reference.layers import LayerNorm, Linear, at_least_float32
 
 
 class FeatureMixer(nn.Module):
-    """Layer norm and a network of one hidden layer, over all positions of a channel."""
+    """Layer norm and a network with one hidden layer, over all positions of a channel."""
 
     def __init__(self, positions: int) -> None:
-        """As wide inside as outside; zero biases."""
+        """Make a network with constant width and zero biases."""
         super().__init__()
         self.mix = nn.Sequential(
             LayerNorm(positions),
@@ -22,21 +22,21 @@ class FeatureMixer(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """(batch, channel, position) to the same."""
+        """Map (batch, channel, position) to the same shape."""
         return maps + self.mix(maps)
 
 
 class MixVpr(nn.Module):
-    """Mixers, then fewer channels, then fewer rows."""
+    """Mixers, then a reduction of channels, then of rows."""
 
     def __init__(self, dim: int, positions: int, channels: int, rows: int, depth: int) -> None:
-        """For feature maps of `dim` channels and so many positions."""
+        """Make a head for feature maps of `dim` channels and `positions` positions."""
         super().__init__()
         self.mix = nn.Sequential(*(FeatureMixer(positions) for _ in range(depth)))
         self.channel_proj = Linear(dim, channels)
         self.row_proj = Linear(positions, rows)
 
     def forward(self, patches: Tensor) -> Tensor:
-        """(batch, dim, rows, columns) to (batch, row, channel)."""
+        """Map (batch, dim, rows, columns) to (batch, row, channel)."""
         maps = self.mix(patches.flatten(2))
         return at_least_float32(self.row_proj(self.channel_proj(maps.mT).mT)).mT

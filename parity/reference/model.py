@@ -1,6 +1,6 @@
 """CriSALAD: the composition of backbone, aggregation and cross-image encoder (paper Figure 1).
 
-DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
+DINO-SALAD, CricaVPR and plain DINOv2 are the same composition with other parts.
 """
 
 import torch
@@ -36,7 +36,7 @@ from parity.reference.vit import Features, ViT
 from parity.reference.vlad import AnyLoc, NetVlad, SuperVlad
 
 TRANSPOSED = (SaladConfig, ConvApConfig, MixVprConfig, BoqConfig)
-"""Whose public descriptors have all local tokens' first number, then all their second."""
+"""Heads whose public descriptors hold the first dimension of all local tokens, then the second."""
 HELD = (
     *TRANSPOSED,
     AnyLocConfig,
@@ -51,17 +51,17 @@ HELD = (
 
 
 class Crisalad(nn.Module):
-    """A whole model. As every module of torch it draws dropout until `eval()` is called.
+    """A whole model. Like every torch module, it applies dropout until `eval()` is called.
 
-    `config.compute_dtype` is the type of the activations; the parameters are float32, but for a
-    float64 model: `compute_dtype="float64"` and `.double()`.
+    `config.compute_dtype` is the type of the activations; parameters are float32. For a float64
+    model, use `compute_dtype="float64"` and `.double()`.
     """
 
     def __init__(self, config: ModelConfig) -> None:
-        """Random parameters; for those of a checkpoint, `load_state_dict`.
+        """Make a model with random parameters; use `load_state_dict` for those of a checkpoint.
 
         Raises:
-            InputError: a part that is none of `crisalad_jax`'s own.
+            InputError: a part that doesn't come with `crisalad_jax`.
         """
         super().__init__()
         if not isinstance(config.aggregator, HELD):
@@ -83,12 +83,12 @@ class Crisalad(nn.Module):
         self.projection = nn.Linear(config.unprojected_dim, dim) if dim else None
 
     def forward(self, images: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Unit descriptors of a batch of images.
+        """Compute unit descriptors of a batch of images.
 
         Args:
             images: (batch, 3, height, width), normalised; the sides fit the backbone.
-            mask: (batch, batch) of bool: `mask[i, j]` says that image i may look at image j. None
-                lets all look at all.
+            mask: (batch, batch) of bool: `mask[i, j]` is whether image i may attend to image j;
+                None allows all.
 
         Returns:
             (batch, descriptor).
@@ -99,7 +99,7 @@ class Crisalad(nn.Module):
         return self.attend_across_images(self.extract_tokens(images), mask)
 
     def extract_tokens(self, images: Tensor) -> Tokens:
-        """The first half of `forward`: every image's tokens, which owe nothing to other images."""
+        """Compute every image's tokens, independent of other images: the first half of `forward`."""
         self.config.check_image_size((images.shape[2], images.shape[3]))
         images = images.to(self.compute_dtype)
         if not isinstance(self.backbone, ViT):
@@ -114,7 +114,7 @@ class Crisalad(nn.Module):
         return self.aggregate(self.backbone(images))
 
     def aggregate(self, features: Features) -> Tokens:
-        """From a backbone's features to the images' tokens, in float32 at least."""
+        """Aggregate a backbone's features into tokens, in at least float32."""
         if isinstance(self.aggregator, Salad | NetVlad | AnyLoc | TransVpr):
             return self.aggregator(features)
         if self.aggregator is not None:
@@ -130,7 +130,7 @@ class Crisalad(nn.Module):
         return Tokens.of_global(pooled) if pooled.ndim == 2 else Tokens(class_token, pooled)
 
     def attend_across_images(self, tokens: Tokens, mask: Tensor | None = None) -> Tensor:
-        """The second half: images look at each other, then become descriptors."""
+        """Compute descriptors with attention across images: the second half of `forward`."""
         if self.encoder is not None:
             global_token = self.config.cross_image.global_token
             sequence = as_sequence(tokens, global_token=global_token).to(self.compute_dtype)
@@ -139,7 +139,7 @@ class Crisalad(nn.Module):
         return self.to_descriptor(tokens)
 
     def to_descriptor(self, tokens: Tokens) -> Tensor:
-        """The global token, then the local ones in the published order; the projection last."""
+        """Concatenate the global token and the local ones in the published order, then project."""
         transposed = isinstance(self.config.aggregator, TRANSPOSED)
         local = published_order(tokens.local) if transposed else tokens.local
         descriptor = l2_normalise(torch.cat([tokens.global_token, local.flatten(1)], dim=1))
@@ -160,7 +160,7 @@ def _backbone(config: Backbone) -> ViT | ResNet | Vgg:
 
 
 def _aggregator(config: ModelConfig) -> nn.Module | None:
-    """What is called `aggregator` in a state, as most public checkpoints have it."""
+    """Make the part named `aggregator` in a state dict, as in most public checkpoints."""
     dim, found = config.backbone.dim, config.aggregator
     if isinstance(found, SaladConfig):
         return Salad(dim, found)
@@ -178,7 +178,7 @@ def _aggregator(config: ModelConfig) -> nn.Module | None:
 
 
 def _aggregation(config: ModelConfig) -> nn.Module | None:
-    """What others name `aggregation`."""
+    """Make the part that other checkpoints name `aggregation`."""
     found = config.aggregator
     if isinstance(found, CosPlaceConfig):
         return CosPlace(config.backbone.dim, found.dim)

@@ -13,7 +13,7 @@ class GemPyramid(GeM):
     """Generalised means over 2 x 2 and 3 x 3 regions, one exponent for all."""
 
     def forward(self, patches: Tensor) -> Tensor:
-        """(batch, dim, rows, columns) to (batch, region, dim), level by level in row order."""
+        """Map (batch, dim, rows, columns) to (batch, region, dim), level by level in row order."""
         return torch.stack([super(GemPyramid, self).forward(r) for r in _regions(patches)], dim=1)
 
 
@@ -28,5 +28,5 @@ def _regions(patches: Tensor) -> list[Tensor]:
 
 
 def _cuts(side: int, level: int) -> list[tuple[int, int]]:
-    """From where to where each part goes: 16 patches in 3 parts are cut at 5 and 11."""
+    """Return start and end of each part: 16 patches in 3 parts are cut at 5 and 11."""
     return list(itertools.pairwise(round(i * side / level) for i in range(level + 1)))

@@ -14,7 +14,7 @@ class Salad(nn.Module):
     """The three networks over features, and the dustbin's score."""
 
     def __init__(self, dim: int, config: SaladConfig) -> None:
-        """For features of width `dim`. Torch's default start, dustbin score 1."""
+        """Make it for features of width `dim`, with torch's initialisation and dustbin score 1."""
         super().__init__()
         self.epsilon = config.epsilon
         self.sinkhorn = config.sinkhorn
@@ -28,7 +28,7 @@ class Salad(nn.Module):
         self.dust_bin = nn.Parameter(torch.ones(()))
 
     def forward(self, features: Features) -> Tokens:
-        """Global and cluster tokens (paper Eq. 6), each L2-normalised, in float32 at least."""
+        """Compute global and cluster tokens (paper Eq. 6), each L2-normalised, in at least float32."""
         global_token = at_least_float32(self.token_features(features.class_token))
         local = at_least_float32(self.cluster_features(features.patches)).flatten(2)
         plan = self.transport(features.patches)[:, :-1].exp()
@@ -36,7 +36,7 @@ class Salad(nn.Module):
         return Tokens(l2_normalise(global_token), l2_normalise(clusters))
 
     def transport(self, patches: Tensor) -> Tensor:
-        """(batch, dim, rows, columns) to logarithms of the plan, (batch, cluster + 1, patch)."""
+        """Map (batch, dim, rows, columns) to the log plan (batch, cluster + 1, patch)."""
         scores = at_least_float32(self.score(patches)).flatten(2)
         return assign_with_dustbin(
             scores, self.dust_bin, epsilon=self.epsilon, config=self.sinkhorn
@@ -53,5 +53,5 @@ def _pointwise_network(dim: int, d_out: int, config: SaladConfig) -> nn.Sequenti
 
 
 def published_order(clusters: Tensor) -> Tensor:
-    """(batch, cluster, dim) to (batch, dim, cluster): the order of the public descriptor."""
+    """Transpose (batch, cluster, dim) to (batch, dim, cluster), the public descriptor's order."""
     return clusters.mT

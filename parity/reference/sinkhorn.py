@@ -1,6 +1,6 @@
 """Sinkhorn in the log domain, with a dustbin (Cuturi 2013; Sarlin et al. 2020; SALAD, CVPR 2024).
 
-Laid out as published, clusters in rows and patches in columns: the transpose of `crisalad_jax`.
+The layout is as published, clusters in rows and patches in columns: the transpose of `crisalad_jax`.
 """
 
 import math
@@ -14,16 +14,16 @@ from crisalad_jax.sinkhorn import SinkhornConfig
 def assign_with_dustbin(
     scores: Tensor, dust_bin: Tensor, *, epsilon: float, config: SinkhornConfig
 ) -> Tensor:
-    """SALAD's assignment of patches to clusters, as logarithms (paper Eqs. 4 and 5).
+    """Assign patches to clusters as in SALAD, in logarithms (paper Eqs. 4 and 5).
 
-    Each patch has mass 1, each cluster 1, the dustbin the rest. Few iterations leave the clusters'
-    masses inexact: the patches are scaled last.
+    Each patch has mass 1, each cluster 1, the dustbin the rest. After few iterations the cluster
+    masses are inexact, because the patches are scaled last.
 
     Args:
         scores: (batch, cluster, patch), with more patches than clusters.
         dust_bin: () score of the dustbin, the same for every patch.
-        epsilon: regularisation that scores are divided by.
-        config: how many iterations.
+        epsilon: regularisation, by which the scores are divided.
+        config: the number of iterations.
 
     Returns:
         (batch, cluster + 1, patch), the dustbin last.

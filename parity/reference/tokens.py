@@ -1,4 +1,4 @@
-"""What an aggregator makes of the images: the tokens that become descriptors."""
+"""The output of an aggregator: tokens that become descriptors."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class Tokens(NamedTuple):
-    """One global token an image, and the local ones: of clusters, or of regions of a pyramid."""
+    """One global token per image, and local ones: of clusters, or of regions of a pyramid."""
 
     global_token: Tensor
     """(batch, global_dim)."""
@@ -16,17 +16,17 @@ class Tokens(NamedTuple):
 
     @classmethod
     def of_global(cls, token: Tensor) -> "Tokens":
-        """(batch, dim), and no local tokens of that width."""
+        """Make tokens from (batch, dim), with no local tokens of that width."""
         return cls(token, token.new_zeros(len(token), 0, token.shape[1]))
 
     @classmethod
     def of_local(cls, tokens: Tensor) -> "Tokens":
-        """(batch, token, dim), and a global one of no numbers."""
+        """Make tokens from (batch, token, dim), with an empty global token."""
         return cls(tokens.new_zeros(len(tokens), 0), tokens)
 
 
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Tensor:
-    """The local tokens, behind the global one cut to their width if it takes part."""
+    """Prepend the global token, cut to the local width, to the local tokens if it takes part."""
     if not global_token:
         return tokens.local
     pieces = tokens.global_token.unflatten(1, (-1, tokens.local.shape[-1]))

@@ -1,4 +1,4 @@
-"""Training: what is frozen, torch's AdamW, and the linear schedule (paper section 4.2)."""
+"""Training: freezing, torch's AdamW, and the linear schedule (paper section 4.2)."""
 
 import re
 from collections.abc import Iterable
@@ -15,15 +15,15 @@ HEAD = ("aggregator.", "aggregation.", "encoder.")
 
 
 def freeze(model: Crisalad, trainable: str) -> list[nn.Parameter]:
-    """Let gradients flow to the parameters that `trainable` names alone, and return those.
+    """Let gradients flow only to the parameters that `trainable` names, and return those.
 
     "head,-adapters" (aggregator and cross-image encoder), "adapters,head" (the paper),
     "last-N-blocks,norm,head" (SALAD: the last N blocks, the final layer norm, and the head), or
-    "all". Batch-norm statistics are buffers: they have no gradient, and in training mode every
-    forward pass updates them.
+    "all". Batch-norm statistics are buffers: they have no gradient, and every forward pass in
+    training mode updates them.
 
     Raises:
-        InputError: an unknown name, or more blocks than there are.
+        InputError: an unknown name, or more blocks than exist.
     """
     depth = len(model.backbone.blocks)
     match = re.fullmatch(r"last-(\d+)-blocks,norm,head", trainable)
@@ -47,7 +47,7 @@ def freeze(model: Crisalad, trainable: str) -> list[nn.Parameter]:
 
 
 def learning_rate_factor(config: OptimiserConfig, step: int, steps: int) -> float:
-    """Share of the peak at `step`: 1 / n to 1 in a warm-up of n steps, then linearly down.
+    """Return the share of the peak at `step`: 1 / n to 1 in n warm-up steps, then linear decay.
 
     The schedule's `end_fraction` is reached after the last of `steps`, counted from 0.
     """
@@ -64,16 +64,16 @@ def train(
     *,
     steps: int,
 ) -> list[float]:
-    """Train `model` in place, one step a batch, and return the loss of each batch.
+    """Train `model` in place, one step per batch, and return the loss of each batch.
 
     Args:
-        model: is left in training mode. Its own configuration holds, not `config.model`.
+        model: left in training mode. Its own configuration is used, not `config.model`.
         batches: (images, labels): (image, 3, height, width), normalised, and (image,).
-        config: loss, optimiser and what trains.
+        config: loss, optimiser and trainable parameters.
         steps: length of the schedule.
 
     Raises:
-        InputError: `config.trainable` does not fit the model.
+        InputError: `config.trainable` doesn't fit the model.
     """
     parameters = freeze(model, config.trainable)
     optimiser = torch.optim.AdamW(
@@ -100,7 +100,7 @@ def train(
 
 
 def clip_gradients(parameters: list[nn.Parameter], largest: float) -> None:
-    """Scale the whole gradient down to the norm `largest`, where it is longer."""
+    """Scale the whole gradient down to the norm `largest` if it is longer."""
     gradients = [p.grad for p in parameters if p.grad is not None]
     norm = torch.nn.utils.get_total_norm(gradients)
     # torch's clip_grad_norm_ divides by the norm + 1e-6; optax, and so crisalad_jax, does not.

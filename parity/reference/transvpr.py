@@ -1,4 +1,4 @@
-"""TransVPR's global descriptor (Wang et al., CVPR 2022, section 3.2) on several ViT layers."""
+"""TransVPR's global descriptor (Wang et al., CVPR 2022, section 3.2) from several ViT layers."""
 
 import torch
 from torch import nn
@@ -10,17 +10,17 @@ from parity.reference.vit import Features
 
 
 class TransVpr(nn.Module):
-    """One attention map a level, from the levels' tokens side by side."""
+    """One attention map per level, from the concatenated tokens of all levels."""
 
     def __init__(self, dim: int, config: TransVprConfig) -> None:
-        """For levels of width `dim`."""
+        """Make a head for levels of width `dim`."""
         super().__init__()
         self.dim = dim
         self.attention = Linear(config.levels * dim, config.levels, bias=False)
         self.reduction = Linear(config.levels * dim, config.dim)
 
     def forward(self, features: Features) -> Tokens:
-        """Features hold (batch, level x dim, rows, columns); one global token, in float32."""
+        """Map features (batch, level x dim, rows, columns) to one global token, in float32."""
         tokens = features.patches.flatten(2).mT
         maps = at_least_float32(self.attention(tokens)).softmax(dim=1).mT
         levels = at_least_float32(tokens).split(self.dim, dim=2)

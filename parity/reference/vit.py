@@ -17,7 +17,7 @@ PATCH_SIZE = ViTConfig.patch_size
 
 
 class Features(NamedTuple):
-    """What a backbone says of the images, after its last layer norm."""
+    """The output of a backbone, after its last layer norm."""
 
     class_token: Tensor
     """(batch, dim)."""
@@ -26,15 +26,15 @@ class Features(NamedTuple):
 
 
 class PatchEmbed(nn.Module):
-    """A linear map of each patch, written as a convolution with as long a stride."""
+    """A linear map of each patch, written as a convolution with stride equal to its size."""
 
     def __init__(self, dim: int) -> None:
-        """From the 3 x 14 x 14 numbers of a patch to `dim`."""
+        """Make a map from the 3 x 14 x 14 values of a patch to `dim`."""
         super().__init__()
         self.proj = Conv2d(3, dim, PATCH_SIZE, stride=PATCH_SIZE)
 
     def forward(self, images: Tensor) -> Tensor:
-        """(batch, 3, height, width) to (batch, patch, dim), patches in row order."""
+        """Map (batch, 3, height, width) to (batch, patch, dim), patches in row order."""
         return self.proj(images).flatten(2).mT
 
 
@@ -42,12 +42,12 @@ class LayerScale(nn.Module):
     """A gain for every channel."""
 
     def __init__(self, dim: int, start: float) -> None:
-        """All gains start at `start`."""
+        """Initialise all gains to `start`."""
         super().__init__()
         self.gamma = nn.Parameter(torch.full((dim,), start))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., dim) to (..., dim)."""
+        """Map (..., dim) to the same shape."""
         return self.gamma.to(x.dtype) * x
 
 
@@ -55,36 +55,36 @@ class Mlp(nn.Module):
     """Feed-forward network: fc1, exact GELU, fc2."""
 
     def __init__(self, dim: int, hidden: int) -> None:
-        """One hidden layer of width `hidden`."""
+        """Make a network with one hidden layer of width `hidden`."""
         super().__init__()
         self.fc1 = Linear(dim, hidden)
         self.fc2 = Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., dim) to (..., dim)."""
+        """Map (..., dim) to the same shape."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
 class SwiGlu(nn.Module):
-    """Feed-forward network of ViT-g (Shazeer 2020): gate and value side by side in w12, then w3."""
+    """Feed-forward network of ViT-g (Shazeer 2020): gate and value concatenated in w12, then w3."""
 
     def __init__(self, dim: int, hidden: int) -> None:
-        """Gate and value are `hidden` wide each."""
+        """Make gate and value layers of width `hidden`."""
         super().__init__()
         self.w12 = Linear(dim, 2 * hidden)
         self.w3 = Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., dim) to (..., dim)."""
+        """Map (..., dim) to the same shape."""
         gate, value = self.w12(x).chunk(2, dim=-1)
         return self.w3(F.silu(gate) * value)
 
 
 class Block(nn.Module):
-    """One block (paper Eq. 2), with LayerScale over MLP and adapter alike, as in CricaVPR."""
+    """One block (paper Eq. 2), with LayerScale over both MLP and adapter, as in CricaVPR."""
 
     def __init__(self, config: ViTConfig) -> None:
-        """With the feed-forward network and the adapter that `config` names."""
+        """Make a block with the feed-forward network and the adapter that `config` names."""
         super().__init__()
         feed_forward = SwiGlu if config.ffn == "swiglu" else Mlp
         self.alpha = getattr(config.adapter, "alpha", 0.0)
@@ -97,7 +97,7 @@ class Block(nn.Module):
         self.adapter = make_adapter(config)
 
     def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
-        """(batch, token, dim) to the same; `grid` is the rows and columns of patches."""
+        """Map (batch, token, dim) to the same shape; `grid` is the rows and columns of patches."""
         tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
         normed = self.norm2(tokens)
         update = self.mlp(normed)
@@ -107,10 +107,10 @@ class Block(nn.Module):
 
 
 class ViT(nn.Module):
-    """The backbone. `mask_token` is DINOv2's of training: held, and never used here."""
+    """The backbone. `mask_token` is DINOv2's training token, stored but never used here."""
 
     def __init__(self, config: ViTConfig) -> None:
-        """Start as DINOv2 does before training: matrices normal of deviation 0.02, biases 0."""
+        """Initialise like DINOv2: matrices normal with deviation 0.02, biases 0."""
         super().__init__()
         dim, side = config.dim, config.position_grid
         if config.position_init == "sincos":
@@ -135,9 +135,10 @@ class ViT(nn.Module):
                 nn.init.trunc_normal_(parameter, std=0.02, a=-0.04, b=0.04)
 
     def forward(self, images: Tensor, depths: Sequence[int] | None = None) -> Features:
-        """(batch, 3, height, width) to features; the sides are multiples of 14.
+        """Map (batch, 3, height, width) to features; the sides are multiples of 14.
 
-        With `depths` the patches after so many blocks, all through the last norm, are concatenated.
+        With `depths`, the patches after those numbers of blocks, each through the last norm, are
+        concatenated.
         """
         grid = grid_of(images)
         if depths is not None:
@@ -153,7 +154,7 @@ class ViT(nn.Module):
         return Features(tokens[:, 0], patches.mT.unflatten(-1, grid))
 
     def facet(self, images: Tensor, number: int, name: str) -> Features:
-        """Queries, keys, values or tokens of block `number` alone, heads side by side (AnyLoc)."""
+        """Return queries, keys, values or tokens of block `number`, heads concatenated (AnyLoc)."""
         grid = grid_of(images)
         tokens = self.embed(images)
         for block in self.blocks[:number]:
@@ -169,7 +170,7 @@ class ViT(nn.Module):
         return Features(found[:, 0], patches.mT.unflatten(-1, grid))
 
     def embed(self, images: Tensor) -> Tensor:
-        """Class token, registers and patches with their positions; registers have none."""
+        """Embed class token, registers and patches, with positions except for registers."""
         patches = self.patch_embed(images)
         positions = self.interpolate_positions(grid_of(images))
         special = self.cls_token + self.pos_embed[:, :1]
@@ -179,16 +180,16 @@ class ViT(nn.Module):
         return torch.cat([special, patches + positions.to(images.dtype)], dim=1)
 
     def run_blocks(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
-        """All blocks in turn."""
+        """Apply all blocks in order."""
         for block in self.blocks:
             tokens = block(tokens, grid)
         return tokens
 
     def interpolate_positions(self, grid: tuple[int, int]) -> Tensor:
-        """Position embeddings of a grid, (1, rows x columns, dim), resized as DINOv2 does.
+        """Resize position embeddings to a grid, (1, rows x columns, dim), like DINOv2.
 
-        Models without registers are resized by the scale (size + 0.1) / side, those with registers
-        to the exact size and antialiased. A grid as stored is left as it is.
+        Models without registers resize by the scale (size + 0.1) / side, those with registers to
+        the exact size with antialiasing. A grid of the stored size is left unchanged.
         """
         stored = self.pos_embed[:, 1:]
         side = round(stored.shape[1] ** 0.5)
@@ -204,12 +205,12 @@ class ViT(nn.Module):
 
 
 def grid_of(images: Tensor) -> tuple[int, int]:
-    """Rows and columns of patches."""
+    """Return rows and columns of patches."""
     return images.shape[-2] // PATCH_SIZE, images.shape[-1] // PATCH_SIZE
 
 
 def _sincos_positions(side: int, dim: int) -> Tensor:
-    """Fixed 2-D sine-cosine codes (MoCo v3's), half the width for rows and half for columns."""
+    """Compute MoCo v3's fixed 2-D sine-cosine codes, half the width each for rows and columns."""
     frequencies = 1e4 ** -(torch.arange(dim // 4) / (dim // 4))
     angles = torch.outer(torch.arange(side), frequencies)
     code = torch.cat([angles.sin(), angles.cos()], dim=1)

@@ -10,31 +10,31 @@ from parity.reference.vit import Features
 
 
 class NetVlad(nn.Module):
-    """Assignment and centroids apart; the names are Nanne/pytorch-NetVlad's."""
+    """Separate assignment and centroids, with the names of Nanne/pytorch-NetVlad."""
 
     def __init__(self, dim: int, clusters: int) -> None:
-        """Random, as torch's layers start."""
+        """Initialise randomly, like torch's layers."""
         super().__init__()
         self.conv = nn.Conv2d(dim, clusters, 1, bias=False)
         self.centroids = nn.Parameter(l2_normalise(torch.randn(clusters, dim)))
 
     def forward(self, features: Features) -> Tokens:
-        """V(k) = sum of a_k(x) (x - c_k) over the patches (Eq. 4), each of length 1."""
+        """Compute V(k) = sum of a_k(x) (x - c_k) over the patches (Eq. 4), each of length 1."""
         patches = F.normalize(at_least_float32(features.patches), dim=1)
         shares = self.conv(patches).softmax(dim=1).flatten(2)
         return _tokens(features, _vlad(shares, patches.flatten(2), self.centroids))
 
 
 class AnyLoc(nn.Module):
-    """Every patch counts for the nearest word."""
+    """Assignment of every patch to its nearest word."""
 
     def __init__(self, dim: int, clusters: int) -> None:
-        """Random words."""
+        """Initialise random words."""
         super().__init__()
         self.words = nn.Parameter(l2_normalise(torch.randn(clusters, dim)))
 
     def forward(self, features: Features) -> Tokens:
-        """V(k) = sum of x - c_k over the patches nearest to word k, each of length 1."""
+        """Compute V(k) = sum of x - c_k over the patches nearest to word k, each of length 1."""
         patches = F.normalize(at_least_float32(features.patches), dim=1).flatten(2)
         nearest = torch.cdist(patches.mT, self.words.expand(len(patches), -1, -1)).argmin(dim=2)
         shares = F.one_hot(nearest, len(self.words)).mT.to(patches.dtype)
@@ -42,16 +42,16 @@ class AnyLoc(nn.Module):
 
 
 class SuperVlad(nn.Module):
-    """Sums of patches, not of residuals; ghosts take shares and are dropped."""
+    """Sums of patches, not of residuals; ghost clusters take shares and are dropped."""
 
     def __init__(self, dim: int, clusters: int, ghosts: int) -> None:
-        """Random, as torch's layers start."""
+        """Initialise randomly, like torch's layers."""
         super().__init__()
         self.clusters = clusters
         self.conv = nn.Conv2d(dim, clusters + ghosts, 1, bias=False)
 
     def forward(self, features: Features) -> Tokens:
-        """V(k) = sum of a_k(x) x over the patches, each of length 1, then all of them together."""
+        """Compute V(k) = sum of a_k(x) x over the patches, each of length 1, then all together."""
         patches = F.normalize(at_least_float32(features.patches), dim=1)
         shares = self.conv(patches).softmax(dim=1).flatten(2)[:, : self.clusters]
         sums = F.normalize(shares @ patches.flatten(2).mT, dim=2)
@@ -59,7 +59,7 @@ class SuperVlad(nn.Module):
 
 
 def _vlad(shares: Tensor, patches: Tensor, centroids: Tensor) -> Tensor:
-    """Shares (batch, cluster, patch) of patches (batch, dim, patch) to (batch, cluster, dim)."""
+    """Sum residuals of patches (batch, dim, patch) by shares (batch, cluster, patch)."""
     residuals = patches[:, None] - centroids[None, :, :, None]
     return l2_normalise((shares[:, :, None] * residuals).sum(dim=3))
 

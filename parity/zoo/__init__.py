@@ -1,9 +1,8 @@
-"""Layouts of published place-recognition models, random weights for them, and the outputs of the
-public code on these.
+"""Layouts of published place-recognition models, random weights for them, and public outputs.
 
-`layouts/NAME.json` has names and shapes as the published file has them; `goldens/NAME.npz` has
-images and what the public code made of them with the weights of `random_state`. The weights of a
-name depend on nothing but the name, the shape and the seed.
+`layouts/NAME.json` has names and shapes as in the published file; `goldens/NAME.npz` has images and
+the outputs of the public code with the weights of `random_state`. The weights of a name depend only
+on the name, the shape and the seed.
 """
 
 import json
@@ -15,7 +14,7 @@ import numpy as np
 
 HERE = pathlib.Path(__file__).parent
 ANYLOC = "anyloc_dinov2_vitb14_l9_value_c32"
-"""A vocabulary, beside the backbone's file."""
+"""A vocabulary, separate from the backbone's file."""
 NAMES = tuple(sorted(path.stem for path in (HERE / "goldens").glob("*.npz") if path.stem != ANYLOC))
 SEED = 11
 CHANGED: tuple[tuple[str, str, float], ...] = (
@@ -41,15 +40,15 @@ CHANGED: tuple[tuple[str, str, float], ...] = (
     ("^vladbuff", r"aggregator\.(centroids|pca_mean)$", 0.5),
     ("^vladbuff", r"WPCA_\d+\.0\.bias$", 0.02),
 )
-"""Weights of another size than the rest: a pattern of models, one of names, and a factor. With them
-a descriptor depends on the image more than on a bias."""
+"""Weights with another scale than the rest: a pattern of models, one of names, and a factor. They
+make a descriptor depend on the image more than on a bias."""
 POSITIVE = ("^apgem", r"^explained_variance_$", 0.005)
-"""As `CHANGED`, of the size of the draws and a little more: variances."""
+"""Like `CHANGED`, for variances: positive, as large as the draws plus a little."""
 FIXED = {
     r"(aggregation(_hashing)?\.1|adpool)\.p$": 3.0,
     r"aggregator\.ab_params$": (8.0, 7.0, 1.0),
 }
-"""Weights that are no draws, by a pattern of names: GeM's exponent, VLAD-BuFF's constants."""
+"""Fixed weights by a pattern of names: GeM's exponent, VLAD-BuFF's constants."""
 
 
 def layout(name: str) -> dict[str, tuple[int, ...]]:

@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# Sets up what is missing, then times this package, torch and other engines, on a machine with nothing else to do.
+# Sets up what is missing, then times this package, torch and other engines, on an otherwise idle machine.
 #
-#     bench_all.sh               all tables and pictures of docs/performance, docs/training and docs/search: hours
-#     bench_all.sh --processor   only descriptors, training steps, products and answers, for a
+#     bench_all.sh               all tables and plots of docs/performance, docs/training and docs/search: hours
+#     bench_all.sh --processor   only descriptors, training steps, products and queries, for a
 #                                processor that is not in docs/performance: an hour or more on two cores
-#     bench_all.sh --gpu         on a GPU that both torch and jax find, into docs/performance-gpu: 15 minutes, not timed yet
+#     bench_all.sh --gpu         on a GPU that both torch and jax find, into docs/performance-gpu: 15 minutes (estimate)
 #
-# --processor and --gpu replace the existing tables. --small after one of them tries it out in small sizes,
-# as on a CPU, and writes the tables to a temporary folder.
-# Flags that follow go to the benches of descriptors and training steps, such as
+# --processor and --gpu replace the existing tables. --small after one of them is a trial with small sizes,
+# also on a CPU, that writes the tables to a temporary folder.
+# Further flags are passed to the benches of descriptors and training steps, for example
 #     --presets b14 --batches 256 --dtypes bfloat16
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -64,5 +64,5 @@ bench index
 bench loader
 bench overlap
 bench memory --take
-# A million descriptors take 34 GB of the folder for temporary files.
+# A million descriptors take 34 GB in the folder for temporary files.
 bench search

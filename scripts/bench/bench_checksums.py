@@ -2,10 +2,11 @@
 
     python scripts/bench/bench_checksums.py [--preset b14] [--images 5000] [--rounds 7]
 
-Each round takes both ways in turns; ratios are medians over rounds. Weights: `load` beside
-`load(verify=False)`, and beside safetensors' own `load_file` with an array of JAX of each array, as
-`load` was before files had checksums. Descriptors: `extract` into a .npy, which keeps its work in
-files, hashes all and can be resumed, beside the same call in memory and numpy's own writing.
+Each round runs both variants in turn; ratios are medians over rounds. Weights: `load` compared with
+`load(verify=False)`, and with safetensors' own `load_file` followed by a conversion of each array
+to JAX, which is what `load` did before files had checksums. Descriptors: `extract` into a .npy,
+which stores its progress in files, hashes everything and can be resumed, compared with the same
+call in memory followed by numpy's own writing.
 """
 
 import argparse
@@ -43,13 +44,13 @@ def main() -> None:
             "load_file": lambda: jax.tree.map(jnp.asarray, load_file(weights)),
         }
         for other, plain in others.items():
-            ratio(f"{size}, beside {other}", lambda: load(weights), plain, 3 * given.rounds)
+            ratio(f"{size}, compared with {other}", lambda: load(weights), plain, 3 * given.rounds)
         if given.images:
             extraction(folder, given.images, given.rounds)
 
 
 def extraction(folder: pathlib.Path, count: int, rounds: int) -> None:
-    """The model `tiny`: beside a larger one checksums would cost less."""
+    """Time `extract` with `tiny`: with a larger model, checksums would cost relatively less."""
     images = folder / "images"
     images.mkdir()
     generator = np.random.default_rng(0)
@@ -76,9 +77,9 @@ def extraction(folder: pathlib.Path, count: int, rounds: int) -> None:
 
 
 def ratio(what: str, checked: Callable[[], object], plain: Callable[[], object], rounds: int):
-    """Print the median, least and most of the ratio of two times, each pair taken in turns."""
+    """Print the median, minimum and maximum ratio of two times, each pair run in turn."""
     for call in (checked, plain):
-        call()  # compiles, and fills the cache of the disk
+        call()  # compiles, and fills the disk cache
     pairs = []
     for number in range(rounds):
         calls = (checked, plain) if number % 2 else (plain, checked)

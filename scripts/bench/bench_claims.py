@@ -1,11 +1,12 @@
-"""How many images published models describe a second, as a share of MegaLoc's, on one device.
+"""Measure the images per second of published models relative to MegaLoc, on one device.
 
     python scripts/bench/bench_claims.py [--out docs/claims] [--batch 16] [--rounds 5]
 
-The models of `docs/claims/claims.toml`, with random weights: the time does not depend on them.
-Images have the size that the model is published for, products are in bfloat16. Every round times
-all models once, MegaLoc first; a share is the median over rounds of those of one round. What is
-timed is `describe`, pixels on the device to descriptors, each image alone, without a second stage.
+It times the models of `docs/claims/claims.toml` with random weights, because the time does not
+depend on the weights. Images have the size that the model is published for; products are in
+bfloat16. Every round times all models once, MegaLoc first; the reported ratio is the median of the
+ratios of each round. The timed function is `describe`, from pixels on the device to descriptors,
+with independent images and no second stage.
 """
 
 import argparse
@@ -30,14 +31,14 @@ SHOWN = "docs/claims"
 
 
 def published() -> dict[str, ModelConfig]:
-    """The configurations of the models, each architecture once, by the first name that has it."""
+    """Collect the model configurations: each architecture once, under its first name."""
     rows = tomllib.loads(CLAIMS.read_text(encoding="utf-8"))["row"]
     names = dict.fromkeys([REFERENCE, *(row["models"][0] for row in rows if "models" in row)])
     return {name: inferred(name)[1] for name in names}
 
 
 def program(config: ModelConfig, batch: int):
-    """A call that describes a batch and waits for it."""
+    """Make a call that describes a batch and waits for the result."""
     config = dataclasses.replace(config, compute_dtype="bfloat16")
     params = jax.jit(lambda: init_crisalad(jax.random.key(0), config))()
     images = jnp.zeros((batch, *config.image_size, 3), jnp.uint8)
@@ -48,7 +49,7 @@ def program(config: ModelConfig, batch: int):
 
 
 def seconds(call, calls: int) -> float:
-    """The median of some calls."""
+    """Return the median seconds of `calls` calls."""
     call()
     times = []
     for _ in range(calls):

@@ -1,11 +1,11 @@
-"""Describe images on a Ray cluster of one-core nodes of this machine, and in one process.
+"""Compare describing images on a local Ray cluster of one-core nodes with one process.
 
     python scripts/bench/bench_cluster.py [--out docs/large]
         [--images 5000] [--nodes 2] [--rounds 3] [--weights starter]
 
-Each node is a raylet of its own, pinned to one core; the one process uses as many cores as there
-are nodes. They take turns. Times are of the whole command `crisalad extract`, start included; the
-cluster runs already. Both files have to be the same, bit for bit.
+Each node is a separate raylet pinned to one core; the single process uses as many cores as there
+are nodes. They take turns. Times cover the whole command `crisalad extract`, including start-up;
+the cluster is already running. The two files should be bit-identical.
 """
 
 import os
@@ -63,12 +63,12 @@ def main() -> None:
     found = [alone / spread for alone, spread in zip(*seconds.values(), strict=True)]
     speed = statistics.median(found), min(found), max(found)
     caption = (
-        f"`crisalad extract` of {arguments.images:,} images by `{arguments.weights}`: "
-        f"{arguments.nodes} nodes of Ray of one core each, and one process of {arguments.nodes} "
-        f"cores, both with their start; {measured(arguments.rounds)}."
+        f"`crisalad extract` of {arguments.images:,} images with `{arguments.weights}`: "
+        f"{arguments.nodes} one-core Ray nodes compared with one process on {arguments.nodes} "
+        f"cores, start-up included; {measured(arguments.rounds)}."
     )
-    rows = [(ONE, "1.00", "-"), (CLUSTER, times(speed), "the same" if same else "others")]
-    table = Table(("describes in", "times as fast", "bits"), rows, caption, 1)
+    rows = [(ONE, "1.00", "-"), (CLUSTER, times(speed), "identical" if same else "different")]
+    table = Table(("run in", "speedup", "bits"), rows, caption, 1)
     leave("bench_cluster", Study(table, {"seconds": seconds, "same_bits": same}), arguments)
 
 

@@ -1,25 +1,28 @@
-"""Images described a second, beside every engine that a user would pick instead, in one run.
+"""Measure images described per second, compared with every engine that a user might pick instead.
 
     python scripts/bench/bench_describe.py [--out docs/performance]
         [--presets b14 megaloc ...] [--sizes 224x224 ...] [--batches 1 8 16]
         [--dtypes float32 bfloat16] [--keep]
 
-The others are torch, eager and through torch.compile, ONNX Runtime and OpenVINO (`engines.py`).
-Torch's model is the reference of the parity checks as users would write it (`usual.py`), with the
-same random weights. Needs torch (the `dev` extra) and the `bench` extra. On a GPU torch alone is
-the other side, if both it and jax find one. Before anything is timed, descriptors are checked to be
-equal to rounding. `timing.py` says how contenders are timed.
+The other engines are torch, eager and with torch.compile, ONNX Runtime and OpenVINO
+(`engines.py`). The torch model is the reference of the parity checks as users would write it
+(`usual.py`), with the same random weights. It needs torch (the `dev` extra) and the `bench` extra.
+On a GPU, torch is the only other engine, if both torch and jax find a GPU. Before anything is
+timed, descriptors are checked to be equal up to rounding. `timing.py` explains how contenders are
+timed.
 
-All get normalised images. "over devices" is how the command line runs it: a device for each core,
-the images spread over them. A single image has one device.
+All engines get normalised images. "over devices" is how the command line runs it: one device per
+core, with the images spread over them. A single image runs on one device.
 
-Memory is what a call needs at once beyond parameters and images: of jax what the compiled program
-sets aside and its output, of torch the peak of what it allocates; the others do not tell. The share
-of the machine is the model's operations (two a multiply-accumulate of `crisalad info`) a second
-over those of the fastest product of matrices that any of the engines reaches.
+Memory is the peak that a call needs beyond parameters and images: for jax, the compiled program's
+temporary buffers and output; for torch, the peak of its allocations; the other engines do not
+report it. The share of the machine is the model's operations per second (two for each
+multiply-accumulate of `crisalad info`) divided by those of the fastest matrix product that any of
+the engines reaches.
 
-All races take an hour and more. With `--keep` those that an earlier run left in the folder, on the
-same machine with the same versions, stay in the tables, so that it can be done in parts.
+All races together take more than an hour. With `--keep`, races that an earlier run left in the
+folder, on the same machine and with the same versions, stay in the tables, so that the work can be
+split over several runs.
 """
 
 import argparse
@@ -55,10 +58,10 @@ from parity.cases.case import build, convert, random
 from parity.reference.model import Crisalad as TorchCrisalad
 
 TOLERANCES = {"float32": 1e-5, "bfloat16": 2e-2}
-"""Of descriptors, which are unit vectors: parity measures 1e-6 and 5e-3 at this size."""
+"""Bounds on the errors of unit descriptors; parity measures 1e-6 and 5e-3 at this size."""
 ENGINES_TOLERANCES = {**TOLERANCES, "float32": 1e-4}
-"""Engines choose their own arithmetic: OpenVINO is off by 1.5e-5 for `s14` in batches of 16, where
-all others agree to 1e-7."""
+"""Wider bounds for engines that choose their own arithmetic: OpenVINO is off by 1.5e-5 for `s14` in
+batches of 16, where all others agree to 1e-7."""
 MODELS: Mapping[str, ModelConfig] = {
     **PRESETS,
     "cosplace-resnet50": ModelConfig(
@@ -87,29 +90,29 @@ MODELS: Mapping[str, ModelConfig] = {
         projection=ProjectionConfig(dim=8448),
     ),
 }
-"""The sizes of CriSALAD, two published models as their files have them, and one of them smaller."""
+"""The sizes of CriSALAD, two published models as in their files, and one of the two smaller."""
 TORCHES = ("torch eager", "torch.compile")
 OURS = ("ours", "ours, over devices")
 CONTENDERS = (*TORCHES, ORT, OPENVINO, *OURS)
-"""In the order of the tables' columns."""
+"""Contenders in the order of the table columns."""
 DRAWN = 8
-"""Images of the races that the picture shows."""
+"""Batch size of the races that the plot shows."""
 
 
 class Contender(NamedTuple):
     name: str
     call: Callable[[], Any]
     memory: Callable[[], int | None]
-    """Bytes; None where an engine does not tell."""
+    """Bytes; None if an engine does not report them."""
     program: Callable[[], str] = str
-    """As XLA compiled it: of torch's, nothing."""
+    """The program's text as XLA compiled it; empty for torch."""
     devices: int = 1
     ready: float = 0.0
-    """Seconds that it took to be made, as a part of the first call."""
+    """Seconds it took to prepare, counted as part of the first call."""
 
 
 class Sides(NamedTuple):
-    """The same model and images for both libraries. Torch's is as users write it."""
+    """The same model and images for both libraries; the torch model is as users write it."""
 
     theirs: TorchCrisalad
     ours: Crisalad
@@ -117,14 +120,14 @@ class Sides(NamedTuple):
     images: np.ndarray
     """(image, height, width, 3), normalised."""
     theirs_images: torch.Tensor
-    """The same, (image, 3, height, width), where torch computes."""
+    """The same, (image, 3, height, width), on the device where torch computes."""
 
 
 def sides(config: ModelConfig, name: str, batch: int, dtype: str) -> Sides:
     model = build(config, dtype, random(name, 0))
     for layer in model.modules():
         if isinstance(layer, torch.nn.BatchNorm2d):
-            # Drawn small, deviations would multiply to infinity.
+            # Small random deviations would multiply to infinity.
             layer.running_var = torch.ones_like(layer.weight)
     ours = convert(model)[0]
     images = np.random.default_rng(0).normal(size=(batch, *config.image_size, 3)).astype(np.float32)
@@ -177,7 +180,7 @@ def seconds(call: Callable[[], Any]) -> float:
 
 
 def check(contenders: Sequence[Contender], tolerance: float) -> None:
-    """The descriptors are equal.
+    """Check that all descriptors are equal within `tolerance`.
 
     Raises:
         RuntimeError: they are not.
@@ -200,17 +203,17 @@ class Case(NamedTuple):
     dtype: str
     contenders: Sequence[Contender]
     first: dict[str, float]
-    """Seconds of each one's first call, compiling included."""
+    """Seconds of each contender's first call, including compilation."""
     operations: float
-    """Of a call."""
+    """Floating-point operations of a call."""
 
 
 Value = dict[str, Any]
-"""What is kept of a race's contender: see `measure`."""
+"""The stored results of one contender in a race; see `measure`."""
 
 
 def measure(case: Case, rate: float, where: str, arguments: argparse.Namespace) -> list[Value]:
-    """Run a race on the machine `where`, which does `rate` operations a second at best."""
+    """Run a race on the machine `where`, whose best rate is `rate` operations per second."""
     calls = {one.name: one.call for one in case.contenders}
     timed = race(calls, arguments.rounds, arguments.calls)
     return [
@@ -230,7 +233,7 @@ def measure(case: Case, rate: float, where: str, arguments: argparse.Namespace) 
 
 
 def races(values: Iterable[Value]) -> list[list[Value]]:
-    """The contenders of each race."""
+    """Group the values by race."""
     found: dict[tuple[Any, ...], list[Value]] = {}
     for value in values:
         found.setdefault((value["model"], value["batch"], value["dtype"]), []).append(value)
@@ -238,7 +241,7 @@ def races(values: Iterable[Value]) -> list[list[Value]]:
 
 
 def kept(old: Iterable[Value], new: Sequence[Value]) -> list[Value]:
-    """Those of an earlier run whose races are not among the new ones, of the same machine."""
+    """Select the old values from the same machine whose races were not run again."""
     again = {(value["model"], value["batch"], value["dtype"]) for value in new}
     where = {value["machine"] for value in new}
     return [
@@ -250,7 +253,7 @@ def kept(old: Iterable[Value], new: Sequence[Value]) -> list[Value]:
 
 
 def per_second(value: Value) -> tuple[float, float, float]:
-    """Images a second: by the median of the rounds, least, most."""
+    """Return images per second: median over rounds, minimum and maximum."""
     found = [1e3 * value["batch"] / ms for ms in value["ms"]]
     return 1e3 * value["batch"] / Timed(value["ms"]).median, min(found), max(found)
 
@@ -262,7 +265,7 @@ def speed(value: Value) -> str:
 
 
 def faster(values: Sequence[Value]) -> dict[str, tuple[float, float, float]]:
-    """How many times as fast as the fastest engine that is not ours each contender is, by name."""
+    """Return each contender's speedup over the fastest engine that is not ours, by name."""
     timed = {value["contender"]: Timed(value["ms"]) for value in values}
     best = min((name for name in timed if name not in OURS), key=lambda name: timed[name].median)
     return {name: ratio(timed[best], one) for name, one in timed.items()}
@@ -277,7 +280,12 @@ def speeds(values: Sequence[Value], caption: str) -> Table:
         cells = (speed(found[name]) if name in found else "" for name in columns)
         share = f"{100 * found[ours]['share of the machine']:.0f} %"
         rows.append((*labels(one), *cells, times(faster(one)[ours]), share))
-    header = (*LABELS, *columns, "ours: times the fastest other", "ours: of the machine")
+    header = (
+        *LABELS,
+        *columns,
+        "ours: speedup over the fastest other",
+        "ours: share of the machine",
+    )
     return Table(header, rows, caption, len(LABELS))
 
 
@@ -310,9 +318,9 @@ def cost(value: Value) -> str:
 
 
 def compare(name: str, what: str, cases: Iterable[Case], arguments: argparse.Namespace) -> None:
-    """Run the races one after the other as they are made; leave tables, numbers and picture.
+    """Run the races one after another; write tables, numbers and plot.
 
-    They are left after every race: what is done stays if the rest is stopped.
+    The files are written after every race, so that finished races survive an interruption.
     """
     where = machine(*packages())
     path = files_of(name, arguments.out)[1]
@@ -342,17 +350,17 @@ def report(name: str, what: str, values: Sequence[Value], arguments: argparse.Na
             "faster",
             f"{DRAWN} images: times the fastest other",
         )
-    caption = f"{what}: images a second. {where}; medians and ranges of {rounds} rounds or more."
+    caption = f"{what}: images per second. {where}; medians and ranges of {rounds} rounds or more."
     study = Study(speeds(values, caption), values, figure)
     leave(name, study, arguments)
-    caption = f"{what}: the first call, compiling included, and memory. {where}."
+    caption = f"{what}: the first call, including compilation, and memory. {where}."
     names = ("model", "batch", "dtype", "contender", "first call", "memory")
     numbers = [{name: value[name] for name in names} for value in values]
     leave(f"{name}_costs", Study(costs(values, caption), numbers), arguments)
 
 
 def in_order(values: Sequence[Value]) -> list[Value]:
-    """By model as `MODELS` has them, size, type and batch; contenders as they were."""
+    """Sort by model in the order of `MODELS`, size, type and batch; keep the order of contenders."""
     models = list(MODELS)
 
     def place(value: Value) -> tuple[int, str, bool, int]:
@@ -384,7 +392,7 @@ def read_race(
     batches: Sequence[int] = (8, 16),
     dtypes: Sequence[str] = ("float32",),
 ) -> argparse.Namespace:
-    """The flags of a race, whose presets can have the sizes."""
+    """Parse the flags of a race, and check that the presets support the sizes."""
     parser = flags(description, "docs/performance")
     parser.add_argument("--presets", nargs="+", default=presets, choices=MODELS)
     parser.add_argument(
@@ -392,7 +400,7 @@ def read_race(
     )
     parser.add_argument("--batches", type=count, nargs="+", default=batches)
     parser.add_argument("--dtypes", nargs="+", default=dtypes, choices=list(TOLERANCES))
-    parser.add_argument("--keep", action="store_true", help="also show races of an earlier run")
+    parser.add_argument("--keep", action="store_true", help="also show the races of an earlier run")
     parser.add_argument("--rounds", type=count, default=5)
     parser.add_argument("--calls", type=count, default=2)
     arguments = read(parser, name, f"{name}_costs")

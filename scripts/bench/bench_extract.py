@@ -1,26 +1,27 @@
-"""From a folder of photographs to a file of descriptors, beside torch and its DataLoader.
+"""Time a folder of photographs to a file of descriptors, compared with torch's DataLoader.
 
     python scripts/bench/bench_extract.py
         [--presets s14 ...] [--images 2000] [--batch 16]
 
-Ours is what `crisalad extract` does: list, decode, resize, describe (independently) over the CPU's
-devices, write. The other side is how it is done in torch: a Dataset that reads and normalises
-an image, a DataLoader with a worker for each core, the reference of the parity checks through
-torch.compile in inference mode, numpy; or through ONNX Runtime or OpenVINO, of the file that torch
-writes. All have the same random weights, and the same functions decode, resize and write. The
-batches are the same: the same images in the same order, each looking at itself only, the last batch
-filled up with images that are not used. Ours goes through the folder for the tokens, then over
-these for the descriptors; the others do both at once.
+Ours is what `crisalad extract` does: list, decode, resize, describe (independently) over the CPU
+devices, write. The torch side is the usual pipeline: a Dataset that reads and normalises an image,
+a DataLoader with one worker per core, the reference of the parity checks with torch.compile in
+inference mode, and numpy; or ONNX Runtime or OpenVINO with the file that torch exports. All have
+the same random weights, and the same functions decode, resize and write. The batches are the same:
+the same images in the same order, each attending only to itself, the last batch padded with unused
+images. Ours goes through the folder for the tokens, then through the tokens for the descriptors;
+the others do both at once.
 
-The photographs are drawn (the synthetic city, 640 x 480, sensor noise, 90 kB each): some distinct
-ones, again and again. They have just been written, so no disk is measured. Both sides are compiled,
-and the descriptors in their files checked to be equal, on a folder of a batch and one image more.
+The photographs are rendered (the synthetic city, 640 x 480, sensor noise, 90 kB each): a few
+distinct ones, repeated. They have just been written, so disk reads are not measured. Both sides are
+compiled, and the descriptors in their files checked to be equal, on a folder with one image more
+than a batch.
 
-Then the contenders take turns, a whole folder each; to start workers, by forking, is part of it.
-"Alone" is a loader whose batches nobody uses: torch's are normalised, ours are not yet. Images are
-waited for while the next batch is asked for, is not there, and no program is in flight. A CPU
-decodes with the cores that compute: those that are busy meanwhile lose nothing by it. Busy is all
-processor time, that of workers and of threads that spin included.
+Then the contenders take turns, a whole folder each; starting the workers, by forking, is included.
+"Alone" is a loader whose batches are discarded: torch's are normalised, ours not yet. "Waited for"
+is the time in which the next batch has been requested and is not ready, and no program is in
+flight. A CPU decodes with the cores that compute, so decoding while they are busy costs no waiting
+time. Busy is all processor time, including that of workers and of spinning threads.
 """
 
 import argparse
@@ -73,7 +74,7 @@ _T = TypeVar("_T")
 
 
 def photograph(number: int, size: tuple[int, int] = SIZE) -> bytes:
-    """A JPEG of the city as a camera would leave it, at (height, width)."""
+    """Encode a JPEG of the city as a camera would produce it, at (height, width)."""
     view = synthetic.View(
         season=synthetic.SEASONS[number % 4], occluders=number, noise=5.0, seed=number
     )
@@ -89,7 +90,7 @@ def write_photographs(folder: pathlib.Path, photographs: Sequence[bytes], count:
 
 
 class Watch:
-    """Seconds in which the next batch was waited for and no program was in flight."""
+    """Count the seconds spent waiting for the next batch while no program was in flight."""
 
     def __init__(self) -> None:
         self.waited = 0.0
@@ -111,7 +112,7 @@ class Watch:
             yield batch
 
     def program(self, call: Callable[..., Any]) -> Callable[..., Any]:
-        """The same call, whose work goes on after it returns; the end of it is noted."""
+        """Wrap a call whose work continues after it returns, and record when that work ends."""
 
         def ended(found: Any) -> float:
             jax.block_until_ready(found)
@@ -128,11 +129,11 @@ class Watch:
 class Contender(NamedTuple):
     name: str
     run: Callable[[pathlib.Path, pathlib.Path, Watch], None]
-    """From a folder to a file; a loader alone leaves none."""
+    """Processes a folder into a file; a loader alone writes none."""
 
 
 def box_mean(values: np.ndarray) -> np.ndarray:
-    """Of every pixel's neighbourhood; at the border of what is left of it."""
+    """Average each pixel's neighbourhood; at the border, the part of it inside the image."""
     side = (LOCAL_WINDOW, LOCAL_WINDOW)
     box = functools.partial(
         cv2.boxFilter, ddepth=-1, ksize=side, normalize=False, borderType=cv2.BORDER_CONSTANT
@@ -149,7 +150,7 @@ def normalised(image: np.ndarray, how: str) -> np.ndarray:
 
 
 class Photographs(torch.utils.data.Dataset[torch.Tensor]):
-    """(3, height, width), normalised."""
+    """Normalised photographs (3, height, width)."""
 
     def __init__(self, paths: Sequence[pathlib.Path], config: ModelConfig) -> None:
         self.paths, self.config = paths, config
@@ -197,7 +198,7 @@ def by_torch(both: Sides, batch: int) -> list[Contender]:
 def by_data_loader(
     both: Sides, batch: int, describe: Callable[[torch.Tensor], np.ndarray]
 ) -> Callable[[pathlib.Path, pathlib.Path, Watch], None]:
-    """From a folder to a file with torch's loader, and what describes a batch of this many."""
+    """Describe a folder into a file with torch's loader and a function that describes a batch."""
 
     def extract(folder: pathlib.Path, out: pathlib.Path, watch: Watch) -> None:
         paths = list_images(folder)
@@ -213,7 +214,7 @@ def by_data_loader(
 
 
 class EachAlone(torch.nn.Module):
-    """A reference model whose images look at none but themselves."""
+    """A reference model in which each image attends only to itself."""
 
     def __init__(self, model: torch.nn.Module, batch: int) -> None:
         super().__init__()
@@ -233,7 +234,7 @@ def by_engines(both: Sides, batch: int) -> list[Contender]:
     def extract(run: Callable[[], np.ndarray]) -> Callable[..., None]:
         def describe(given: torch.Tensor) -> np.ndarray:
             images[:] = given.numpy()
-            return run().copy()  # the next call's results may be written over them
+            return run().copy()  # the next call may overwrite the results
 
         return by_data_loader(both, batch, describe)
 
@@ -269,7 +270,7 @@ def by_us(both: Sides, batch: int) -> list[Contender]:
 
 
 def check(contenders: Sequence[Contender], folder: pathlib.Path, temporary: pathlib.Path) -> None:
-    """Compile, and see that the files hold the descriptors of the first.
+    """Compile, and check that all files hold the descriptors of the first contender.
 
     Raises:
         RuntimeError: they do not.
@@ -287,9 +288,9 @@ def check(contenders: Sequence[Contender], folder: pathlib.Path, temporary: path
 class Run(NamedTuple):
     seconds: float
     waited: float
-    """For images, as a share of the seconds."""
+    """Time spent waiting for images, as a share of the total."""
     busy: float
-    """Share of all cores' time."""
+    """Processor time, as a share of all cores' time."""
 
 
 def measure(contender: Contender, folder: pathlib.Path, out: pathlib.Path) -> Run:
@@ -305,7 +306,7 @@ def measure(contender: Contender, folder: pathlib.Path, out: pathlib.Path) -> Ru
 def compare(
     preset: str, folders: tuple[pathlib.Path, pathlib.Path], arguments: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """What one model's contenders took for the second folder, compiled and checked on the first."""
+    """Time one model's contenders on the second folder; compile and check them on the first."""
     both = sides(PRESETS[preset], preset, arguments.batch, "float32")
     (torch_extract, torch_load), (our_extract, our_load) = (
         by(both, arguments.batch) for by in (by_torch, by_us)
@@ -335,7 +336,7 @@ def compare(
     ]
 
 
-HEADER = ("model", "images", "contender", "times faster", "images waited for", "cores busy")
+HEADER = ("model", "images", "contender", "speedup", "images waited for", "cores busy")
 
 
 def row(value: dict[str, Any]) -> tuple[str, ...]:
@@ -354,7 +355,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=count, default=3)
     arguments = read(parser, "bench_extract")
     compiler.configure()
-    # The workers that are forked do not use JAX.
+    # The forked workers do not use JAX.
     warnings.filterwarnings("ignore", r"os\.fork\(\) was called")
     values = []
     with tempfile.TemporaryDirectory(prefix="extract-") as temporary:
@@ -367,9 +368,9 @@ def main() -> None:
     caption = (
         f"From a folder of JPEGs ({SIZE[1]} x {SIZE[0]}) to a file of descriptors, in batches of "
         f"{arguments.batch}, float32, {measured(arguments.rounds, *packages())} of a whole "
-        "folder. Times faster: than torch with its DataLoader, and of the loaders alone than that "
-        "one. Images waited for: the share of the time in which no program is in flight because "
-        "the next batch is not there. Cores busy: of all cores' time."
+        "folder. Speedup: over torch with its DataLoader, and for the loaders alone over "
+        "DataLoader alone. Images waited for: the share of the time in which no program is in "
+        "flight because the next batch is not ready. Cores busy: the share of all cores' time."
     )
     table = Table(HEADER, [row(value) for value in values], caption, 3)
     figure = bars(

@@ -1,16 +1,17 @@
-"""Training data of the size of GSV-Cities: how long its index takes, in what memory; then an epoch.
+"""Measure indexing training data of the size of GSV-Cities: time and memory; then an epoch.
 
     python scripts/bench/bench_index.py [--out docs/training]
         [--tree FOLDER] [--cities 23] [--places 2000] [--images 560000] [--size 64]
 
-Writes a tree in the layout of GSV-Cities: so many cities of so many places, each place a small JPEG
-(a pattern of its own) from several years, 560,000 images in all; in FOLDER, where it stays and is
-used again, or in a temporary one. It takes a file of the disk's smallest size for each image.
+It writes a tree in the layout of GSV-Cities: a number of cities with a number of places each, every
+place a small JPEG with a distinct pattern from several years, 560,000 images in all; in FOLDER,
+where it stays and is reused, or in a temporary folder. Each image takes one file of the disk's
+smallest size.
 
-Then, in a program of its own that imports nothing else: the index is read (every row of every CSV
+Then, in a separate process that imports nothing else: the index is read (every row of every CSV
 checked, every image found), the first epoch is drawn, and its first batch of 48 places x 4 images
-is read. In another: the epoch from end to end, as training would read it, RandAugment included.
-Memory is the most that the program ever had, the interpreter and its libraries included.
+is read. In another process: the whole epoch, as training would read it, with RandAugment. Memory is
+the peak of the process, including the interpreter and its libraries.
 """
 
 import argparse
@@ -33,7 +34,7 @@ from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.progress import progress_bar
 
 LIMIT_SECONDS, LIMIT_BYTES = 10, 1e9
-"""Of the index and its memory."""
+"""Limits on the time and the memory of the index."""
 BLOCKS = 8
 """Coloured squares along a side of a place's pattern."""
 _PROGRAM = """
@@ -77,7 +78,7 @@ print(json.dumps(found | dict(memory_in_all=memory())))
 
 
 def write_tree(root: pathlib.Path, cities: int, places: int, images: int, size: int) -> None:
-    """A tree of the layout of GSV-Cities: `images` spread alike over `cities` x `places`."""
+    """Write a tree in the layout of GSV-Cities: `images` spread evenly over `cities` x `places`."""
     views = np.full(cities * places, images // (cities * places))
     views[: images - views.sum()] += 1
     generator = np.random.default_rng(0)
@@ -104,9 +105,9 @@ def write_tree(root: pathlib.Path, cities: int, places: int, images: int, size: 
 
 
 def _row(city: str, place: int, view: int) -> tuple[Any, ...]:
-    """As in COLUMNS; the position in degrees has as many digits as the published ones."""
+    """Make a row of COLUMNS; the position in degrees has as many digits as the published ones."""
     latitude, longitude = 40 + place / 1e5 + 1e-7 / 3, -70 - place / 1e5 - 1e-7 / 3
-    panorama = f"{place:08d}_{view:03d}_abcdefghij"  # 22 characters, as Google's
+    panorama = f"{place:08d}_{view:03d}_abcdefghij"  # 22 characters, like Google's
     return place, 2008 + view, 1 + view % 12, 30 * view % 360, city, latitude, longitude, panorama
 
 
@@ -119,7 +120,7 @@ def _file_name(row: tuple[Any, ...]) -> str:
 
 
 def make_tree(root: pathlib.Path, arguments: argparse.Namespace) -> None:
-    """Write the tree, unless it is there.
+    """Write the tree unless it already exists.
 
     Raises:
         InputError: `root` holds something else.
@@ -151,8 +152,8 @@ def table(values: dict[str, dict[str, float]]) -> Table:
     ]
     caption = (
         f"An index of {index['images']:,} images of {index['places']:,} places in "
-        f"{index['cities']} cities, whose files the system had at hand; an epoch of "
-        f"{epoch['steps']:,} steps of 192 images was then read to its end, every image valid."
+        f"{index['cities']} cities, with files in the page cache; an epoch of "
+        f"{epoch['steps']:,} steps of 192 images was then read completely, every image valid."
     )
     return Table(("what", "found", "limit"), rows, caption)
 
@@ -163,10 +164,10 @@ def _megabytes(size: float) -> str:
 
 def main() -> None:
     parser = flags(__doc__ or "", "docs/training")
-    parser.add_argument("--tree", type=pathlib.Path, help="where it stays")
+    parser.add_argument("--tree", type=pathlib.Path, help="folder to store and reuse the tree")
     parser.add_argument("--cities", type=count, default=23)
-    parser.add_argument("--places", type=count, default=2000, help="of each city")
-    parser.add_argument("--images", type=count, default=560_000, help="in all")
+    parser.add_argument("--places", type=count, default=2000, help="places per city")
+    parser.add_argument("--images", type=count, default=560_000, help="images in total")
     parser.add_argument("--size", type=count, default=64, help="side of an image in pixels")
     arguments = read(parser, "bench_index")
     places = arguments.cities * arguments.places

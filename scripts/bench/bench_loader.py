@@ -1,20 +1,20 @@
-"""Training batches from JPEG files, beside torch's DataLoader with Pillow; no model.
+"""Time training batches from JPEG files, compared with torch's DataLoader and Pillow; no model.
 
     python scripts/bench/bench_loader.py [--out docs/training]
         [--images 960] [--batch 192] [--rounds 5]
 
 Both read the same files in the same order, as batches of 224 x 224, each image augmented by
 RandAugment (3 operations at magnitude 9 of 31). Ours is what training does (`training_batches`:
-OpenCV and threads); the batches are of 8-bit pixels, which the compiled step normalises. The other
+OpenCV and threads); the batches hold 8-bit pixels, which the compiled step normalises. The other
 side is how the public VPR code does it: a Dataset whose transforms are Pillow's decoding, Resize,
-RandAugment, ToTensor, Normalize, and a DataLoader with a worker for each core. (RandAugment is the
+RandAugment, ToTensor, Normalize, and a DataLoader with one worker per core. (RandAugment is the
 reference of the tests: torchvision's operations on Pillow images.)
 
-The photographs are drawn (the synthetic city, sensor noise, JPEG of quality 92) at three sizes:
-GSV-Cities' 400 x 300, MSLS' 640 x 480, and a telephone's 1600 x 1200; some distinct ones, again and
-again. They have just been written, so no disk is measured. The contenders take turns, an epoch
-each, on one core of this machine (each has a worker, or a thread, beside its main thread) and on
-all of them; the start of workers, by forking, is part of it.
+The photographs are rendered (the synthetic city, sensor noise, JPEG of quality 92) at three sizes:
+GSV-Cities' 400 x 300, MSLS' 640 x 480, and a phone's 1600 x 1200; a few distinct ones, repeated.
+They have just been written, so disk reads are not measured. The contenders take turns, an epoch
+each, on one core of this machine (each has a worker or a thread in addition to its main thread)
+and on all cores; starting the workers, by forking, is included.
 """
 
 import argparse
@@ -58,7 +58,7 @@ TORCH, OURS = "DataLoader, Pillow", "ours"
 
 
 def write_tree(root: pathlib.Path, images: int, size: tuple[int, int]) -> None:
-    """One city in the layout of GSV-Cities."""
+    """Write one city in the layout of GSV-Cities."""
     photographs = [photograph(number, size) for number in range(DISTINCT)]
     folder, rows = root / "Images" / "City", []
     folder.mkdir(parents=True)
@@ -73,7 +73,7 @@ def write_tree(root: pathlib.Path, images: int, size: tuple[int, int]) -> None:
 
 
 class Photographs(torch.utils.data.Dataset[tuple[torch.Tensor, int]]):
-    """(3, height, width) and the place."""
+    """Normalised images (3, height, width), each with its place."""
 
     def __init__(self, places: Places) -> None:
         self.places = places
@@ -89,7 +89,7 @@ class Photographs(torch.utils.data.Dataset[tuple[torch.Tensor, int]]):
         image = image.resize((INPUT[1], INPUT[0]), Image.Resampling.BILINEAR)
         generator = random.Random(index)
         image = rand_augment(image, AUGMENT.operations, AUGMENT.magnitude, generator)
-        # As torchvision's ToTensor.
+        # Like torchvision's ToTensor.
         pixels = torch.from_numpy(np.array(image)).permute(2, 0, 1).contiguous()
         values = pixels.to(torch.float32).div(255)
         return (values - self.mean) / self.deviation, int(self.places.image_place[index])
@@ -131,7 +131,7 @@ def by_us(places: Places, batch: int) -> Callable[[], int]:
 
 @contextlib.contextmanager
 def on_cores(cores: set[int]) -> Iterator[None]:
-    """For this thread, and for threads and processes that it starts."""
+    """Pin this thread, and the threads and processes that it starts, to `cores`."""
     if len(ONE_AND_ALL) == 1:
         yield
         return
@@ -185,9 +185,9 @@ def main() -> None:
     if arguments.batch % IMAGES_PER_PLACE or arguments.images < arguments.batch:
         parser.error(
             f"found {arguments.images} images in batches of {arguments.batch}, expected a multiple "
-            f"of {IMAGES_PER_PLACE}, and one batch at least"
+            f"of {IMAGES_PER_PLACE}, and at least one batch"
         )
-    # The workers that are forked do not use JAX.
+    # The forked workers do not use JAX.
     warnings.filterwarnings("ignore", r"os\.fork\(\) was called")
     values = [value for size in SIZES for value in compare(size, arguments)]
     rows = [
@@ -201,10 +201,10 @@ def main() -> None:
     ]
     caption = (
         f"Training batches of {arguments.batch} images with RandAugment from JPEGs of three sizes, "
-        f"no model; {measured(arguments.rounds)} of an epoch of {arguments.images} images. Times "
-        "faster than a DataLoader with Pillow on as many cores."
+        f"no model; {measured(arguments.rounds)} of an epoch of {arguments.images} images. Speedup: "
+        "over a DataLoader with Pillow on the same number of cores."
     )
-    header = ("files", "cores", "contender", "times faster")
+    header = ("files", "cores", "contender", "speedup")
     fewest = [value for value in values if value["cores"] == len(ONE_AND_ALL[0])]
     label = f"times as fast, cores: {len(ONE_AND_ALL[0])}"
     figure = bars(fewest, lambda value: value["size"], "faster", label)

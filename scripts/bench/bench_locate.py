@@ -1,13 +1,13 @@
-"""Latency of `Map.locate` on some cores, by JAX and by the engines that `--runtime auto` takes.
+"""Measure the latency of `Map.locate` with JAX and the engines of `--runtime auto`, by core count.
 
     python scripts/bench/bench_locate.py [--out docs/performance]
         [--preset tiny s14 b14]
         [--runtime jax onnxruntime openvino] [--cores 1 2 4] [--rounds 5]
 
-Each run is a process of its own on the first N cores. It asks a map of 64 images where one camera's
-frame was taken, over and over, as a robot does; the engines' first answers have to be the same.
-Numbers of cores that this machine does not have are left out. Ratios are to the fastest engine on
-as many cores, and to the same engine on the fewest.
+Each run is a separate process on the first N cores. It queries a map of 64 images with one camera
+frame, over and over, as a robot does; the first answers of all engines must agree. Core counts that
+this machine does not have are skipped. Ratios are relative to the fastest engine on the same number
+of cores, and to the same engine on the fewest cores.
 """
 
 import json
@@ -53,7 +53,7 @@ ENGINES = ("jax", "onnxruntime", "openvino")
 def measure(
     preset: str, engines: list[str], cores: list[int], rounds: int
 ) -> dict[tuple[int, str], Timed]:
-    """Make a map with random weights, and ask it by each engine in turn.
+    """Make a map with random weights, and query it with each engine in turn.
 
     Raises:
         RuntimeError: the engines answer differently.
@@ -88,7 +88,7 @@ def main() -> None:
     arguments = read(parser, "bench_locate")
     cores = [n for n in sorted(set(arguments.cores)) if n <= usable_cores()]
     if not cores:
-        parser.error(f"found {usable_cores()} cores, expected as many as one of --cores")
+        parser.error(f"found {usable_cores()} cores, expected at least the smallest of --cores")
     values: list[dict[str, Any]] = []
     rows = []
     for preset in arguments.preset:
@@ -100,8 +100,8 @@ def main() -> None:
             values.append({**kept, "slower": slower, "over the fewest cores": more})
             rows.append((preset, f"{n}", engine, f"{one.median:.1f}", times(slower), times(more)))
     header = (
-        *("model", "cores", "engine", "ms", "time over the fastest's"),
-        f"speed over {cores[0]} core{'s' * (cores[0] > 1)}",
+        *("model", "cores", "engine", "ms", "time relative to the fastest"),
+        f"speedup over {cores[0]} core{'s' * (cores[0] > 1)}",
     )
     words = measured(arguments.rounds, *packages())
     caption = f"`Map.locate` of one image of 640 x 480, the model loaded: {words}."

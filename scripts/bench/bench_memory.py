@@ -1,13 +1,13 @@
-"""Memory of a training step of the paper's size, by the compiler's analysis; and one step taken.
+"""Measure the memory of a training step of the paper's size by the compiler's analysis.
 
     python scripts/bench/bench_memory.py [--out docs/training]
         [--preset b14] [--images 192] [--micro-batches 24] [--take]
 
-The paper's recipe (adapters and head train, the rest is frozen), 48 places x 4 images, compiled for
-one device: in float32 and bfloat16, at once and by micro-batches. Temporary is what the program
-needs beside what it is given; given are weights, moments and images. `--take` also takes one step
-by micro-batches in float32, over this machine's devices, on random images; its memory is the most
-that the program ever had, the compiler included.
+The paper's recipe (adapters and head train, the rest is frozen) with 48 places x 4 images is
+compiled for one device: in float32 and bfloat16, all at once and in micro-batches. "temporary" is
+what the program needs in addition to its inputs; the inputs are weights, moments and images.
+`--take` also takes one step in float32 with micro-batches, over this machine's devices, on random
+images; its memory is the peak of the process, including the compiler.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 
 CARD = 24e9
-"""Bytes of the card that a step is to fit."""
+"""Bytes of the card that a step should fit on."""
 
 
 def step_of(config: TrainConfig, dtype: str, micro_batch: int | None) -> StepConfig:
@@ -45,7 +45,7 @@ def batch_of(config: TrainConfig, images: int) -> tuple[np.ndarray, np.ndarray, 
 
 
 def analysed(config: TrainConfig, step: StepConfig, images: int) -> dict[str, Any]:
-    """Bytes, without making any array."""
+    """Analyse the memory of a step in bytes, without allocating any array."""
 
     def start() -> Any:
         state, frozen = init_train_state(
@@ -74,7 +74,7 @@ def taken(config: TrainConfig, step: StepConfig, images: int) -> dict[str, Any]:
     state = jax.jit(lambda tree: jax.tree.map(jax.numpy.copy, tree))(devices.replicate(state))
     pixels, labels, valid = map(devices.shard_batch, batch_of(config, images))
     state, metrics = train_step(state, frozen, pixels, labels, valid, jax.random.key(1), step)
-    # Linux counts in KiB, others in bytes.
+    # Linux reports KiB, other systems bytes.
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "steps": int(state.step),
@@ -94,16 +94,16 @@ def table(values: dict[str, Any], arguments: argparse.Namespace) -> Table:
         rows.append((one["type"], batch, *sizes, "yes" if size < CARD else "no"))
     caption = (
         f"Memory in GB of a training step of {arguments.images} images, {arguments.preset} at "
-        "224 x 224, for one device, by the analysis of XLA "
+        "224 x 224, for one device, by XLA's memory analysis "
         f"({jax.default_backend()}, jax {jax.__version__})."
     )
     if one := values.get("taken"):
         caption += (
             f" One such step was taken, {arguments.micro_batches[0]} images at a time in float32, "
-            f"on {one['devices']} devices of a CPU: loss {one['loss']:.3f}, the program's memory "
-            f"at most {one['memory'] / 1e9:.1f} GB."
+            f"on {one['devices']} CPU devices: loss {one['loss']:.3f}, peak memory of the process "
+            f"{one['memory'] / 1e9:.1f} GB."
         )
-    header = ("type", "images", "temporary", "given", "in all", "fits 24 GB")
+    header = ("type", "images", "temporary", "inputs", "total", "fits 24 GB")
     return Table(header, rows, caption, 2)
 
 

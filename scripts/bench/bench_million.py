@@ -1,18 +1,19 @@
-"""A map of a million synthetic descriptors: made, indexed and asked, next to plain FAISS.
+"""Build, index and query a map of a million synthetic descriptors, compared with plain FAISS.
 
     python scripts/bench/bench_million.py [--out docs/large]
         [--rows 1000000] [--length 512] [--dtype float16] [--searches ivf-rabitq] [--queries 100]
         [--rounds 3] [--folder FOLDER]
 
-Descriptors are views of places along streets (`bench_search.views`), appended to a map of files
-4,096 at a time. Neighbours fade into those of the next places, places have from a dozen to hundreds
-of views, and the numbers of a descriptor fall as the principal components of photographs do.
+Descriptors are views of places along streets (`bench_search.views`), appended to a map stored in
+files, 4,096 at a time. Neighbours fade into those of the next places, places have from a dozen to
+hundreds of views, and the dimensions of a descriptor decay like the principal components of
+photographs.
 
 Ours is what `crisalad index --search` and `crisalad query` do: build an index from the files, take
-candidates from it, and rank them by the descriptors in the files. FAISS has all descriptors in
-memory in float32, in its flat index; and the same index as ours, asked without ranking its answers
-again. All take turns, with one query and with all. Recall is the share of the exact 10 nearest.
-Memory is what a process grows by when it opens an index.
+candidates from it, and rank them by the descriptors in the files. FAISS searches its flat index,
+with all descriptors in memory in float32; and the same index as ours, without re-ranking its
+answers. All take turns, with one query and with all. Recall is the share of the exact 10 nearest
+neighbours. Memory is how much a process grows when it opens an index.
 """
 
 import argparse
@@ -52,14 +53,14 @@ HEADER = (
     "building",
     "memory",
     "recall",
-    "one query, to exact of files",
-    "one query, to exact in memory",
-    "all queries, to exact in memory",
+    "one query, speedup over exact in files",
+    "one query, speedup over exact in memory",
+    "all queries, speedup over exact in memory",
 )
 
 
 def parts(rows: int, length: int) -> Iterator[np.ndarray]:
-    """The descriptors, some thousand at a time; the same at every call."""
+    """Yield the descriptors, a few thousand at a time; every call yields the same."""
     generator = np.random.default_rng(0)
     places = streets(generator, rows, length)
     for start in range(0, rows, TOGETHER):
@@ -67,12 +68,12 @@ def parts(rows: int, length: int) -> Iterator[np.ndarray]:
 
 
 def questions(rows: int, length: int, number: int) -> np.ndarray:
-    """Other views of the places."""
+    """Draw other views of the places, as queries."""
     return views(np.random.default_rng(1), streets(np.random.default_rng(0), rows, length), number)
 
 
 def make(folder: pathlib.Path, arguments: argparse.Namespace) -> float:
-    """Append all descriptors to a map; the seconds that this took."""
+    """Append all descriptors to a map, and return the seconds this took."""
     metadata = MapMetadata(
         model="0" * 64,
         weights="none",
@@ -93,13 +94,16 @@ def make(folder: pathlib.Path, arguments: argparse.Namespace) -> float:
 
 
 def resident() -> int:
-    """The memory that this program has, in bytes."""
+    """Return the resident memory of this process in bytes."""
     pages = pathlib.Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]
     return 4096 * int(pages)
 
 
 def memory_of(file: pathlib.Path) -> int:
-    """What a program grows by as it opens an index; one that built it has memory left over."""
+    """Measure how much a process grows when it opens an index.
+
+    It runs in a fresh process: the one that built the index has free memory left over.
+    """
     before = resident()
     index = load_index(file, verify=False)
     assert index.size
@@ -160,10 +164,11 @@ def study(arguments: argparse.Namespace, folder: pathlib.Path) -> Study:
         for who, value in values.items()
     ]
     caption = (
-        f"A map of {rows:,} descriptors of {length} numbers in {arguments.dtype} "
-        f"({size / 1e9:.2f} GB of files, {VIEWS} views of a place), asked for {K} neighbours of "
-        f"one query and of {arguments.queries}; {measured(arguments.rounds)}. Queries are times as "
-        "fast as the exact search of the files, and as FAISS's of descriptors in memory in float32."
+        f"A map of {rows:,} descriptors of {length} dimensions in {arguments.dtype} "
+        f"({size / 1e9:.2f} GB of files, {VIEWS} views per place), searched for the {K} nearest "
+        f"neighbours of one query and of {arguments.queries}; {measured(arguments.rounds)}. "
+        "Speedups are over our exact search in the files, and over FAISS's exact search in memory "
+        "in float32."
     )
     found = {"rows": rows, "append_seconds": seconds, "segments": size, "searches": values}
     return Study(Table(HEADER, table, caption, 1), found)
@@ -177,11 +182,11 @@ def main() -> None:
     parser.add_argument("--searches", nargs="*", choices=SEARCHES, default=["ivf-rabitq"])
     parser.add_argument("--queries", type=count, default=100)
     parser.add_argument("--rounds", type=count, default=3)
-    parser.add_argument("--folder", type=pathlib.Path, help="with room for the map")
+    parser.add_argument("--folder", type=pathlib.Path, help="folder with space for the map")
     arguments = read(parser, "bench_million")
     folder = arguments.folder or pathlib.Path(tempfile.gettempdir())
     needed = 8 * arguments.length * arguments.rows
-    with contextlib.suppress(OSError):  # said when it is written to
+    with contextlib.suppress(OSError):  # reported when it is written to
         if (free := shutil.disk_usage(folder).free) < needed:
             parser.error(
                 f"{folder}: found {free / 1e9:.1f} GB free, expected {needed / 1e9:.1f} GB"

@@ -1,14 +1,14 @@
-"""What bfloat16 gains and loses beside float32, and why there is no int8, in one run.
+"""Measure what bfloat16 gains and loses compared with float32, and why there is no int8.
 
     python scripts/bench/bench_modes.py
         [--presets s14 b14] [--batch 8] [--run demo/run] [--city demo/city]
 
-Four tables. One product of matrices, of the size of `b14`'s widest: its rate by type and by the
-library that XLA gives it to. Descriptors of a batch, images spread over the devices: times as fast
-as float32, and the cosine of each to its own in float32; parameters are those of the parity checks,
-random. And of a trained model, by default the demo's, if it is there: cosines of descriptors, and
-Recall@K, in both; and the cosine of each part's gradient, of batches of its training images.
-`timing.py` says how contenders are timed.
+It writes four tables. One matrix product, of the size of the widest in `b14`: its speed by type and
+by the library that XLA uses. Descriptors of a batch, with images spread over the devices: the
+speedup over float32, and the cosine of each to the same descriptor in float32; parameters are the
+random ones of the parity checks. And for a trained model, by default the demo's, if it exists:
+cosines of descriptors and Recall@K in both types; and the cosine of each part's gradient, on
+batches of its training images. `timing.py` explains how contenders are timed.
 """
 
 import argparse
@@ -45,7 +45,7 @@ from crisalad_jax.utils.pytree import named_leaves
 from parity.cases.case import build, convert, random
 
 TYPES = {"float32": "float32", "bfloat16": "float32", "int8": "int32"}
-"""What is multiplied, and in what it is added up."""
+"""The type of the factors, and the type of their sums."""
 DEFAULT = "jaxlib's choice"
 CHOICES = {DEFAULT: {}, **LIBRARIES}
 ROWS, WIDTH, HIDDEN = 2056, 768, 3072
@@ -76,13 +76,13 @@ def products(arguments: argparse.Namespace) -> Study:
         rows.append((dtype, sums, library, times(faster)))
     size = f"{ROWS} x {WIDTH} by {WIDTH} x {HIDDEN}"
     caption = f"One product, {size}, {measured(arguments.rounds)}."
-    header = ("type", "sums", "library", f"times as fast as float32, {DEFAULT}")
+    header = ("type", "sums", "library", f"speedup over float32, {DEFAULT}")
     figure = bars(values, lambda value: value["type"], "faster", "times float32")
     return Study(Table(header, rows, caption, 3), values, figure)
 
 
 def cosines(narrow: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Of unit vectors."""
+    """Return the cosines of unit vectors."""
     return np.sum(narrow.astype(np.float64) * wide, axis=-1)
 
 
@@ -115,9 +115,9 @@ def speed(arguments: argparse.Namespace) -> Study:
         rows.append((preset, times(faster), f"{alike.mean():.5f}", f"{alike.min():.5f}"))
     caption = (
         f"Descriptors of {arguments.batch} images in bfloat16, {measured(arguments.rounds)}. "
-        "Cosine: to the same in float32."
+        "Cosine: to the same descriptor in float32."
     )
-    header = ("model", "times as fast as float32", "mean cosine", "least cosine")
+    header = ("model", "speedup over float32", "mean cosine", "smallest cosine")
     figure = bars(values, lambda v: v["model"], "faster", "times float32's speed")
     return Study(Table(header, rows, caption, 1), values, figure)
 
@@ -152,10 +152,10 @@ def recall(arguments: argparse.Namespace) -> Study:
                 (dtype, result.grouping, *found, f"{alike.mean():.5f}", f"{alike.min():.5f}")
             )
     caption = (
-        f"Recall@K of a trained model on {benchmark.name}, {len(benchmark.queries)} queries; the "
-        f"cosine of the queries' descriptors (single) to the same in float32. {machine()}."
+        f"Recall@K of a trained model on {benchmark.name}, {len(benchmark.queries)} queries; cosines "
+        f"of the queries' descriptors (single) to those in float32. {machine()}."
     )
-    header = ("type", "grouping", "R@1", "R@5", "R@10", "mean cosine", "least cosine")
+    header = ("type", "grouping", "R@1", "R@5", "R@10", "mean cosine", "smallest cosine")
     figure = bars(values, lambda v: v["grouping"], "R@1", "Recall@1")
     return Study(Table(header, rows, caption, 2), values, figure)
 
@@ -163,7 +163,7 @@ def recall(arguments: argparse.Namespace) -> Study:
 def directions(
     params: Crisalad, config: TrainConfig, batches: list[np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """The gradient of each batch's loss as a unit vector, by part of the model."""
+    """Return the gradient of each batch's loss as a unit vector, by part of the model."""
     many, images = config.places_per_batch, config.images_per_place
     labels, valid = np.repeat(np.arange(many), images), np.ones(many * images, bool)
     step = step_config(config, steps=1)
@@ -185,7 +185,7 @@ def directions(
 def gradients(arguments: argparse.Namespace) -> Study:
     params, model = load_weights(arguments.run / "last.safetensors")
     config = read_config(TrainConfig, arguments.run / "config.json")
-    # Rounding may flip which pairs are mined, and a run of one step has no warm-up.
+    # Rounding may change which pairs are mined, and a run of one step has no warm-up.
     config = dataclasses.replace(
         config,
         loss=dataclasses.replace(config.loss, miner="none"),
@@ -215,10 +215,10 @@ def gradients(arguments: argparse.Namespace) -> Study:
     height, width = model.image_size
     caption = (
         f"Cosines of gradients in bfloat16 to those in float32: {len(batches)} batches of {many} "
-        f"places x {images} images of {height} x {width} at a trained model, all pairs in the "
-        f"loss, {machine()}."
+        f"places x {images} images of {height} x {width}, a trained model, all pairs in the loss, "
+        f"{machine()}."
     )
-    return Study(Table(("part of the gradient", "median", "least"), rows, caption), values)
+    return Study(Table(("part of the gradient", "median", "smallest"), rows, caption), values)
 
 
 def main() -> None:
@@ -229,7 +229,7 @@ def main() -> None:
     parser.add_argument("--calls", type=count, default=2)
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("demo/run"))
     parser.add_argument("--city", type=pathlib.Path, default=pathlib.Path("demo/city"))
-    parser.add_argument("--batches", type=count, default=5, help="of gradients")
+    parser.add_argument("--batches", type=count, default=5, help="batches of gradients")
     studies = {
         "bench_products": products,
         "bench_bfloat16": speed,

@@ -1,14 +1,14 @@
-"""Whether a training step waits for its images: the loader beside the step, and alone.
+"""Measure whether a training step waits for its images, compared with the loader alone.
 
     python scripts/bench/bench_overlap.py [--out docs/training]
         [--presets tiny s14] [--batch 48] [--steps 12] [--rounds 3]
 
-Runs of `fit` (the paper's recipe, from random weights) on drawn photographs of 400 x 300, as
-`bench_loader.py` draws them, with RandAugment. `waited_for_images` of `metrics.jsonl` is the share
-of a step's time between the end of the step before and its images being on the devices. Each run
-is followed by its loader alone on the same files: the share that a step would wait if nothing were
-read ahead, on the same cores. The first steps are left out: they hold what is compiled, and the
-batches that are read before any step.
+It runs `fit` (the paper's recipe, from random weights) on rendered photographs of 400 x 300, made
+as in `bench_loader.py`, with RandAugment. `waited_for_images` in `metrics.jsonl` is the share of a
+step's time between the end of the previous step and the arrival of its images on the devices. Each
+run is followed by its loader alone on the same files: the share that a step would wait if nothing
+were read ahead, on the same cores. The first steps are left out, because they include compilation
+and use batches that were read before any step.
 """
 
 import argparse
@@ -35,7 +35,7 @@ LEFT_OUT = 4
 
 
 def steps_of(config: TrainConfig, places: Places, out: pathlib.Path) -> tuple[list[float], ...]:
-    """Seconds of each step, and the share of each that was waiting."""
+    """Return the seconds of each step, and the share of each that was spent waiting."""
     fit(config, places, out)
     lines = read_metrics(out / "metrics.jsonl")[LEFT_OUT:]
     images = config.places_per_batch * config.images_per_place
@@ -44,7 +44,7 @@ def steps_of(config: TrainConfig, places: Places, out: pathlib.Path) -> tuple[li
 
 
 def loader_alone(config: TrainConfig, places: Places) -> list[float]:
-    """Seconds of each batch."""
+    """Return the seconds of each batch."""
     seconds, started = [], time.perf_counter()
     for _ in PlaceBatches(config, places).batches(0):
         seconds.append(time.perf_counter() - started)
@@ -93,10 +93,10 @@ def main() -> None:
         rows.append((value["preset"], f"{100 * loader / step:.1f} %", f"{100 * waited:.1f} %"))
     caption = (
         f"Training steps of {arguments.batch} images with RandAugment from JPEGs of 400 x 300, "
-        f"medians of {arguments.rounds} runs of {arguments.steps} steps: the loader's own time and "
-        "what a step waits for it, both as shares of the step's time."
+        f"medians of {arguments.rounds} runs of {arguments.steps} steps: the loader's time alone and "
+        "the time that a step waits for it, both as shares of the step's time."
     )
-    header = ("model", "loader alone", "waited in training")
+    header = ("model", "loader alone", "waiting in training")
     leave("bench_overlap", Study(Table(header, rows, caption), values), arguments)
 
 

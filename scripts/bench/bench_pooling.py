@@ -1,4 +1,4 @@
-"""Max pooling forward and backward, as a ResNet begins: ours, XLA's own gradient, and torch's.
+"""Time ResNet's max pooling, forward and backward: ours, XLA's own gradient, and torch.
 
 python scripts/bench/bench_pooling.py
 """
@@ -18,20 +18,20 @@ import torch  # isort: skip
 from crisalad_jax.nn.convolutions import max_pool
 
 MAPS = {"96 of 48 x 64 x 32": (96, 48, 64, 32), "16 of 112 x 112 x 64": (16, 112, 112, 64)}
-"""Images of rows x columns x dims: of `starter`'s first training, and of a ResNet at 224 x 224."""
+"""Images x rows x columns x channels: `starter`'s first training, and a ResNet at 224 x 224."""
 OURS, XLAS, TORCHS = "ours", "XLA's own gradient", "torch eager"
 
 
 def by_xla(x: jax.Array) -> jax.Array:
-    """Pool as `max_pool`, and leave the gradient to JAX."""
+    """Pool like `max_pool`, and leave the gradient to JAX."""
     margins = ((0, 0), (1, 1), (1, 1), (0, 0))
     return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), margins)
 
 
 def contenders(shape: tuple[int, ...]) -> dict[str, Callable[[], Any]]:
-    """Each pools and takes the gradient; all three gradients are checked to be equal."""
+    """Make calls that pool and take the gradient, and check that all three gradients agree."""
     generator = np.random.default_rng(0)
-    images = np.maximum(generator.standard_normal(shape, np.float32), 0)  # as behind a ReLU
+    images = np.maximum(generator.standard_normal(shape, np.float32), 0)  # as after a ReLU
     pooled = (shape[0], shape[1] // 2, shape[2] // 2, shape[3])
     change = generator.standard_normal(pooled, np.float32)
 
@@ -45,7 +45,7 @@ def contenders(shape: tuple[int, ...]) -> dict[str, Callable[[], Any]]:
 
         return lambda: jax.block_until_ready(both(x, y))[1]
 
-    # Channels are last in memory, which torch's convolutions on a CPU prefer, too.
+    # Channels are last in memory, which torch's convolutions on a CPU also prefer.
     theirs = torch.from_numpy(images).permute(0, 3, 1, 2).requires_grad_()
     theirs_change = torch.from_numpy(change).permute(0, 3, 1, 2)
 
@@ -57,7 +57,7 @@ def contenders(shape: tuple[int, ...]) -> dict[str, Callable[[], Any]]:
     calls = {OURS: by(lambda x: max_pool(x, 3, padding=1)), XLAS: by(by_xla), TORCHS: by_torch}
     expected = by_torch().permute(0, 2, 3, 1).numpy()
     for name in (OURS, XLAS):
-        # Sums of up to four numbers, in other orders.
+        # Sums of up to four numbers, in different orders.
         np.testing.assert_allclose(calls[name](), expected, rtol=0, atol=1e-5, err_msg=name)
     return calls
 
@@ -73,10 +73,8 @@ def main() -> None:
             slower = times(ratio(one, timed[OURS]))
             values.append({"maps": name, "contender": contender, "ms": one.rounds})
             rows.append((name, contender, slower))
-    caption = (
-        f"Max pooling of 3 x 3 by 2, forward and backward, float32, {measured(arguments.rounds)}."
-    )
-    table = Table(("maps", "by", "time over ours"), rows, caption, 2)
+    caption = f"Max pooling, 3 x 3 with stride 2, forward and backward, float32, {measured(arguments.rounds)}."
+    table = Table(("maps", "implementation", "time relative to ours"), rows, caption, 2)
     leave("bench_pooling", Study(table, values), arguments)
 
 

@@ -1,11 +1,11 @@
-"""Where the time of our programs goes, by a trace of `jax.profiler`.
+"""Break down the time of our programs with a trace of `jax.profiler`.
 
     python scripts/bench/bench_profile.py
         [--presets tiny s14 b14] [--batch 8]
 
-Descriptors of a batch and a training step, on the devices that the command line uses. Every
-operation that the trace shows is of one of `KINDS`, by what the compiled program says of it. Shares
-are of the time of all devices; parameters are those of the parity checks, random.
+It traces the description of a batch and a training step, on the devices that the command line
+uses. Every operation in the trace is assigned to one of `KINDS` by its entry in the compiled
+program. Shares are of the time of all devices; parameters are the random ones of the parity checks.
 """
 
 import gzip
@@ -31,7 +31,7 @@ from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.trainable import shards_batch
 
 KINDS: dict[str, tuple[str, str]] = {
-    # By the name of an operation, and what it was made of.
+    # By the name of an operation, and the JAX operation it was compiled from.
     "between devices": (r"all-|collective|reduce-scatter", ""),
     "attention's products": (
         r"dot|gemm|cublas|cudnn|onednn|ynn|custom-call",
@@ -45,11 +45,11 @@ KINDS: dict[str, tuple[str, str]] = {
     ),
     "numbers one by one, sums": ("", ""),
 }
-"""The first that fits: regular expressions, of which both are found."""
+"""Pairs of regular expressions; an operation is of the first kind whose expressions both match."""
 NOTHING = "nothing"
 SECONDS = 1
 WITHIN = re.compile(r"(while|call|cond|conditional)(\.|$)")
-"""What only holds other operations."""
+"""Operations that only contain others."""
 INSTRUCTION = re.compile(
     r"^\s*(?:ROOT )?%?([\w.\-]+) = .*?(?:op_name=\"([^\"]*)\"|$)", re.MULTILINE
 )
@@ -64,7 +64,7 @@ def kind(name: str, made_of: str) -> str:
 
 
 def milliseconds(events: Iterable[Mapping[str, Any]], program: str) -> dict[str, float]:
-    """By kind, of what a trace of `program` (its text as XLA compiled it) has among its events."""
+    """Sum a trace's milliseconds by kind, for the operations of `program` (XLA's compiled text)."""
     made_of = dict(INSTRUCTION.findall(program))
     found: dict[str, float] = dict.fromkeys(KINDS, 0.0)
     for event in events:
@@ -75,7 +75,7 @@ def milliseconds(events: Iterable[Mapping[str, Any]], program: str) -> dict[str,
 
 
 def traced(contender: Contender) -> dict[str, float]:
-    """Shares of the time of all devices by kind, and of that in which they do nothing."""
+    """Measure shares of the time of all devices by kind, and the share in which they are idle."""
     contender.call()
     with tempfile.TemporaryDirectory(prefix="bench-profile-") as folder:
         with jax.profiler.trace(folder):
@@ -90,7 +90,7 @@ def traced(contender: Contender) -> dict[str, float]:
         raise RuntimeError(f"{contender.name}: found no operation of its program in the trace")
     total = contender.devices * wall
     shares = {kind: spent / total for kind, spent in found.items()}
-    # A device may do two things at once, so that all kinds may be more than all of the time.
+    # A device may do two things at once, so the kinds may sum to more than all of the time.
     return shares | {NOTHING: max(0.0, 1 - sum(shares.values()))}
 
 

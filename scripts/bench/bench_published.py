@@ -1,9 +1,9 @@
-"""Images that published models describe a second, raced as in `bench_describe.py`.
+"""Measure images per second of published models, raced as in `bench_describe.py`.
 
     python scripts/bench/bench_published.py
         [--presets cosplace-resnet50 megaloc] [--batches 8] [--dtypes bfloat16]
 
-One of each family, at the size of images that it is published for.
+It runs one model of each family, at the image size that it is published for.
 """
 
 from bench_describe import cases, compare, read_race

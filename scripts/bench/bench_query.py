@@ -1,12 +1,12 @@
-"""From a question to its answer: `crisalad query` with each runtime, beside a script of one's own.
+"""Time `crisalad query` from start to answer with each runtime, compared with a custom script.
 
     python scripts/bench/bench_query.py [--out docs/performance]
         [--preset tiny b14] [--runtime jax onnxruntime openvino] [--rounds 5]
 
-Each is a program of its own that is asked where one photograph was taken, in a map of 64. What can
-be kept from one run to the next (compiled programs, exported models) was left there by a run
-before. The script is what a user would write to be quick: numpy, OpenCV and ONNX Runtime, with the
-exported model and the map's descriptors in a file of numpy's.
+Each contender is a separate process that finds where one photograph was taken, in a map of 64
+images. An earlier run has filled the caches (compiled programs, exported models). The script is
+what a user would write for speed: numpy, OpenCV and ONNX Runtime, with the exported model and the
+map's descriptors in a .npy file.
 """
 
 import pathlib
@@ -43,7 +43,7 @@ IMAGES = 64
 
 
 def write_photographs(folder: pathlib.Path) -> None:
-    """Make pictures of blurred noise, as large as a camera's."""
+    """Write pictures of blurred noise, as large as a camera's."""
     folder.mkdir()
     generator = np.random.default_rng(0)
     for number in range(IMAGES):
@@ -53,7 +53,7 @@ def write_photographs(folder: pathlib.Path) -> None:
 
 
 def spent(command: list[str], cache: pathlib.Path) -> tuple[float, float]:
-    """Run a program; return its seconds by the clock and of the processor."""
+    """Run a program, and return its wall-clock and processor seconds."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds, _ = run_program(command, {"XDG_CACHE_HOME": str(cache)})
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -63,7 +63,7 @@ def spent(command: list[str], cache: pathlib.Path) -> tuple[float, float]:
 def programs(
     folder: pathlib.Path, preset: str, runtimes: list[str]
 ) -> dict[str, Callable[[], tuple[float, float]]]:
-    """What asks once, by name, with all that is kept already there."""
+    """Make calls that query once, by name, with caches already filled."""
     config = PRESETS[preset]
     photographs, weights, places = (folder / name for name in ("images", "w.safetensors", "map"))
     write_photographs(photographs)
@@ -113,9 +113,14 @@ def main() -> None:
             both = {"ms": one.rounds, "processor_ms": processor[name].rounds}
             values.append({"model": preset, "contender": name, **both, "slower": slower})
             rows.append((preset, name, times(slower), times(more)))
-    header = ("model", "program", "time over the script's", "processor's time over the script's")
+    header = (
+        "model",
+        "program",
+        "time relative to the script",
+        "processor time relative to the script",
+    )
     caption = (
-        "From the start of a program to the answers to one photograph, what is kept being there: "
+        "From the start of a process to the answers for one photograph, with caches filled: "
         f"{measured(arguments.rounds, *packages())}."
     )
     figure = bars(values, lambda value: str(value["model"]), "slower", "time over the script's")

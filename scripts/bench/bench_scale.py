@@ -4,9 +4,9 @@
         [--preset s14] [--rounds 3]
 
 One of the three grows at a time; the others stay at 4 images of 224 x 224 with 64 clusters
-(clusters grow at 322 x 322, where there are patches enough for 256). Time and operations are of one
-image, over those of the smallest value of what grows. Ours has one device, with all cores, as
-torch. Nothing here should grow faster than the operations.
+(clusters grow at 322 x 322, which has enough patches for 256). Time and operations are per image,
+relative to the smallest value of what grows. Ours runs on one device with all cores, like torch.
+Nothing here should grow faster than the operations.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ class Point(NamedTuple):
 def points(preset: str) -> Iterator[Point]:
     config = PRESETS[preset]
     head = config.aggregator
-    assert isinstance(head, SaladConfig)  # of which the flag has presets alone
+    assert isinstance(head, SaladConfig)  # the flag accepts only such presets
 
     def at(size: int, clusters: int = head.clusters) -> ModelConfig:
         aggregator = dataclasses.replace(head, clusters=clusters)
@@ -49,7 +49,7 @@ def points(preset: str) -> Iterator[Point]:
 
 
 def measure(points: Sequence[Point], rounds: int) -> Iterator[dict[str, Any]]:
-    """Time ours and torch's at all points in turn: other users of a machine slow all alike."""
+    """Time ours and torch's at all points in turn, so that other load slows all of them equally."""
     found = []
     for point in points:
         both = sides(point.config, point.grows, point.batch, "float32")
@@ -73,7 +73,7 @@ def measure(points: Sequence[Point], rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def grown(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Add how much each value has grown over the first of what grows."""
+    """Add how much each value has grown relative to the first of its kind."""
     first = {value["grows"]: value for value in reversed(values)}
     found = []
     for value in values:
@@ -87,8 +87,8 @@ def grown(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def table(values: list[dict[str, Any]], caption: str) -> Table:
     header = (
-        *("what grows", "to", "operations an image", "our time an image", "torch's"),
-        *("ours: times torch's speed", "our memory, MB", "torch's, MB"),
+        *("what grows", "to", "operations per image", "our time per image", "torch's"),
+        *("our speedup over torch", "our memory, MB", "torch's, MB"),
     )
     rows = []
     for value in values:
@@ -130,8 +130,8 @@ def main() -> None:
     values = [each for _, some in together for each in measure([*some], arguments.rounds)]
     values = grown(values)
     caption = (
-        f"`{arguments.preset}` in float32, time and operations of one image over those of the "
-        f"least, on one device: {machine()}; medians and ranges of {arguments.rounds} rounds."
+        f"`{arguments.preset}` in float32, time and operations per image relative to the smallest "
+        f"size, on one device: {machine()}; medians and ranges of {arguments.rounds} rounds."
     )
     leave("bench_scale", Study(table(values, caption), values, draw(values)), arguments)
 

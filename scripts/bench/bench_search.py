@@ -1,4 +1,4 @@
-"""Search beside FAISS: exact speed, memory as the database grows, what approximate indexes miss.
+"""Compare search with FAISS: exact speed, memory by database size, recall of approximate indexes.
 
     python scripts/bench/bench_search.py [bench_search] [search_memory] [search_approximate]
         [--out docs/search]
@@ -6,17 +6,17 @@
         [--memory-rows 100000 1000000] [--memory-length 8448] [--dtype float32] [--folder FOLDER]
         [--approximate-rows 100000] [--approximate-length 512]
 
-bench_search: exact search of the 20 nearest, database and queries in memory, beside a flat FAISS
-index by L2 and by inner product; all on all cores. Descriptors are random unit vectors: what an
-exact search does depends little on them.
+bench_search: exact search of the 20 nearest neighbours, database and queries in memory, compared
+with a flat FAISS index by L2 and by inner product; all on all cores. Descriptors are random unit
+vectors, because the cost of an exact search hardly depends on them.
 
-search_memory: exact search in a memory-mapped file of random unit vectors, a program of its own for
-each size; its peak of memory by Linux's account, the interpreter, JAX and its compiler included. A
-million descriptors of 8,448 numbers are a file of 33.8 GB in float32, 16.9 GB in bfloat16: FOLDER
-is where they are written to, by default the system's for temporary files.
+search_memory: exact search in a memory-mapped file of random unit vectors, in a separate process
+for each size; its peak memory as Linux reports it, including the interpreter, JAX and its compiler.
+A million descriptors of 8,448 dimensions are a file of 33.8 GB in float32, 16.9 GB in bfloat16:
+they are written to FOLDER, by default the system's folder for temporary files.
 
-search_approximate: HNSW and IVF-RaBitQ next to the exact search of the same descriptors, here views
-of places along streets, as an approximate search lives of neighbours that lie together.
+search_approximate: HNSW and IVF-RaBitQ compared with exact search of the same descriptors. These
+are views of places along streets, because approximate search relies on clustered neighbours.
 """
 
 import argparse
@@ -46,18 +46,18 @@ from crisalad_jax.utils.progress import progress_bar
 K = 20
 QUERIES_IN_MEMORY = 100
 VIEWS = 25
-"""Of each place, on average."""
+"""Number of views of a place, on average."""
 SPREAD = 0.4, 1.2
-"""Length of what is a view's own, next to that of its place: least and most."""
+"""Length of a view's own component relative to its place's: minimum and maximum."""
 NEXT, STREET = 0.8, 100
-"""Product of the places next to each other in a street, and how many a street has."""
+"""Inner product of neighbouring places in a street, and the number of places in a street."""
 FALL = 0.4
-"""By this power of its number a component is smaller: 0.41 is that of 800 photographs of SPED by
-the packaged model, by a line through the logarithms of 255 deviations."""
+"""Components decay with this power of their index: 0.41 fits 800 photographs of SPED described by
+the packaged model, from a line through the logarithms of 255 deviations."""
 L2, IP, OURS = "FAISS flat, L2", "FAISS flat, inner product", "crisalad-jax"
 DTYPES = {"float32": np.float32, "bfloat16": ml_dtypes.bfloat16}
 EFFORTS: dict[str, tuple[int | None, ...]] = {"hnsw": (32, None), "ivf-rabitq": (16, None)}
-"""Beside the default; see `Index.search`."""
+"""Efforts to try, None for the default; see `Index.search`."""
 _PROGRAM = """
 import json, pathlib, re, sys
 from crisalad_jax.retrieval.descriptor_files import open_npy
@@ -67,7 +67,7 @@ from crisalad_jax.retrieval.search import search
 set_up()
 database, queries = map(open_npy, sys.argv[1:3])
 search(database, queries, int(sys.argv[3]), quiet=False)
-# What getrusage says begins with the memory of the program that started this one.
+# The value of getrusage starts from the memory of the process that started this one.
 status = pathlib.Path("/proc/self/status").read_text(encoding="utf-8")
 memory = 1024 * int(re.search(r"VmHWM:\\s*(\\d+) kB", status)[1])
 print(json.dumps({"memory": memory}))
@@ -83,7 +83,7 @@ def random_unit(generator: np.random.Generator, rows: int, length: int) -> np.nd
 
 
 def faiss_search(index: Any, metric: int, queries: np.ndarray) -> Callable[[], Any]:
-    """By another metric on the same vectors, of which two copies would fill the memory."""
+    """Make a search by `metric` on the same vectors, because two copies would fill the memory."""
 
     def call() -> Any:
         index.metric_type = metric
@@ -132,10 +132,10 @@ def speed(arguments: argparse.Namespace) -> Study:
     ]
     caption = (
         f"Exact search of {K} neighbours of {arguments.queries:,} queries among "
-        f"{arguments.rows:,} descriptors in memory; {measured(arguments.rounds)}. Times as fast as "
-        "FAISS's flat L2 index, and how many of the neighbours have the same rank in ours."
+        f"{arguments.rows:,} descriptors in memory; {measured(arguments.rounds)}. Speedup over "
+        "FAISS's flat L2 index, and the share of neighbours that have the same rank in ours."
     )
-    header = ("length", "program", "times as fast", "same")
+    header = ("length", "program", "speedup", "same rank")
     figure = bars(
         values, lambda value: f"{value['length']:,} numbers", "faster", "times as fast as flat L2"
     )
@@ -143,7 +143,7 @@ def speed(arguments: argparse.Namespace) -> Study:
 
 
 def write_descriptors(path: pathlib.Path, rows: int, length: int, dtype: str) -> None:
-    """As numpy would save them, some at a time."""
+    """Write random descriptors as a .npy file, in parts."""
     generator = np.random.default_rng(0)
     size = max(1, 2**24 // length)
     with (
@@ -160,7 +160,7 @@ def write_descriptors(path: pathlib.Path, rows: int, length: int, dtype: str) ->
 
 
 def grown(rows: int, arguments: argparse.Namespace, folder: pathlib.Path) -> dict[str, Any]:
-    """A search in a database of so many rows, which is removed again."""
+    """Measure a search in a database of `rows` rows, and remove the database afterwards."""
     length = arguments.memory_length
     database, queries = folder / f"{rows}.npy", folder / "queries.npy"
     try:
@@ -186,21 +186,21 @@ def memory(arguments: argparse.Namespace) -> Study:
     ]
     caption = (
         f"Exact search of {K} neighbours of {QUERIES_IN_MEMORY} queries in a memory-mapped file of "
-        f"descriptors of {arguments.memory_length:,} numbers in {arguments.dtype}: the file and "
-        f"the most memory that the program had, in GB ({machine()})."
+        f"descriptors of {arguments.memory_length:,} dimensions in {arguments.dtype}: size of the "
+        f"file and peak memory of the process, in GB ({machine()})."
     )
     header = ("descriptors", "file", "memory")
     return Study(Table(header, rows, caption, 0), values)
 
 
 def components(generator: np.random.Generator, rows: int, length: int) -> np.ndarray:
-    """Random unit vectors of numbers that fall as principal components do."""
+    """Draw random unit vectors whose dimensions decay like principal components."""
     sizes = (np.arange(1, length + 1) ** -FALL).astype(np.float32)
     return unit(generator.standard_normal((rows, length), np.float32) * sizes)
 
 
 def streets(generator: np.random.Generator, rows: int, length: int) -> np.ndarray:
-    """Places of which so many views are to be drawn, each like the one before in its street."""
+    """Draw the places for `rows` views, each similar to the previous one in its street."""
     places = components(generator, max(1, rows // VIEWS), length)
     for place in range(1, len(places)):
         if place % STREET:
@@ -209,14 +209,14 @@ def streets(generator: np.random.Generator, rows: int, length: int) -> np.ndarra
 
 
 def views(generator: np.random.Generator, places: np.ndarray, rows: int) -> np.ndarray:
-    """Views of places: some places have hundreds, most a dozen, and some views are far off."""
+    """Draw views of places: some places have hundreds, most a dozen, and some views are outliers."""
     drawn = (generator.random(rows) ** 2 * len(places)).astype(int)
     spread = generator.uniform(*SPREAD, (rows, 1)).astype(np.float32)
     return unit(places[drawn] + spread * components(generator, rows, places.shape[1]))
 
 
 def among(found: np.ndarray, exact: np.ndarray) -> float:
-    """The share of the exact neighbours that are anywhere among those that were found."""
+    """Return the share of the exact neighbours that are anywhere among those found."""
     pairs = zip(exact, found, strict=True)
     return sum(int(np.isin(one, some).sum()) for one, some in pairs) / exact.size
 
@@ -273,18 +273,17 @@ def approximate(arguments: argparse.Namespace) -> Study:
     ]
     caption = (
         f"Search of {K} neighbours of {arguments.queries:,} queries among {count:,} descriptors of "
-        f"{length} numbers, {VIEWS} views of a place; {measured(arguments.rounds)}. Recall is the "
-        "share of the exact neighbours that were found, and of those that are among the best "
-        f"{5 * K}, to be ranked exactly; building takes as many times the exact search of all "
-        "queries."
+        f"{length} dimensions, {VIEWS} views per place; {measured(arguments.rounds)}. Recall is the "
+        "share of the exact neighbours that were found, and the share that is among the best "
+        f"{5 * K}, for exact ranking; building time is relative to the exact search of all queries."
     )
     header = (
         "index",
         "recall",
         f"among {5 * K}",
-        "times as fast",
+        "speedup",
         "building",
-        "bytes a descriptor",
+        "bytes per descriptor",
     )
     return Study(Table(header, rows, caption, 1), values)
 
@@ -301,7 +300,9 @@ def main() -> None:
     parser.add_argument("--memory-rows", type=count, nargs="+", default=[100_000, 1_000_000])
     parser.add_argument("--memory-length", type=count, default=8448)
     parser.add_argument("--dtype", choices=DTYPES, default="float32")
-    parser.add_argument("--folder", type=pathlib.Path, help="with room for the largest file")
+    parser.add_argument(
+        "--folder", type=pathlib.Path, help="folder with space for the largest file"
+    )
     parser.add_argument("--approximate-rows", type=count, default=100_000)
     parser.add_argument("--approximate-length", type=count, default=512)
     arguments = read_some(parser, STUDIES)
@@ -309,7 +310,7 @@ def main() -> None:
         folder = arguments.folder or pathlib.Path(tempfile.gettempdir())
         size = np.dtype(DTYPES[arguments.dtype]).itemsize * arguments.memory_length
         needed = max(arguments.memory_rows) * size
-        with contextlib.suppress(OSError):  # said when it is written to
+        with contextlib.suppress(OSError):  # reported when it is written to
             if (free := shutil.disk_usage(folder).free) < needed:
                 parser.error(
                     f"{folder}: found {free / 1e9:.1f} GB free, expected {needed / 1e9:.1f} GB"

@@ -1,12 +1,12 @@
-"""Clients on this machine who ask `crisalad serve` at once: latency, rate, and what is lost.
+"""Measure `crisalad serve` under concurrent clients: latency, throughput and lost requests.
 
     python scripts/bench/bench_serve.py MAP IMAGES [--out docs/serve]
         [--clients 1 8 32] [--seconds 20]
 
-The service is a program of its own. Each client has a connection, and posts one of the images after
-the other, as fast as it is answered. Latency is what the client waits, its own work included. Every
-answer is compared with that of `crisalad query`: the same names, similarities within 5e-6, for
-batches of other sizes round otherwise.
+The service is a separate process. Each client has one connection and posts one image after
+another, as fast as it gets answers. Latency is what the client waits, including its own work. Every
+answer is compared with that of `crisalad query`: the same names, and similarities within 5e-6,
+because batches of other sizes round differently.
 """
 
 import contextlib
@@ -35,25 +35,25 @@ ROUNDING = 5e-6
 
 
 class Load(NamedTuple):
-    """What some clients found."""
+    """The results of some concurrent clients."""
 
     clients: int
     seconds: float
     latencies: list[float]
-    """Of the answers, in ms."""
+    """Latencies of the answers, in ms."""
     lost: int
     """Requests without an answer."""
     others: int
-    """Answers that are not those of `crisalad query`."""
+    """Answers that differ from those of `crisalad query`."""
 
     @property
     def rate(self) -> float:
-        """Answers a second."""
+        """Return answers per second."""
         return len(self.latencies) / self.seconds
 
 
 def expected_answers(folder: pathlib.Path, images: pathlib.Path) -> dict[pathlib.Path, Any]:
-    """What `crisalad query` says of each image."""
+    """Return the answers of `crisalad query` for each image."""
     with Map.open(folder) as places:
         answers = query(places, images, k=K, reading=Reading(quiet=True))
     return {
@@ -64,7 +64,7 @@ def expected_answers(folder: pathlib.Path, images: pathlib.Path) -> dict[pathlib
 
 @contextlib.contextmanager
 def served(folder: pathlib.Path) -> Iterator[str]:
-    """Run the service, and say where it is once it answers."""
+    """Run the service, and yield its address once it answers."""
     command = [sys.executable, "-m", "crisalad_jax", "serve", "--map", str(folder), "--port", "0"]
     with subprocess.Popen([*command, "--quiet"], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -87,7 +87,7 @@ def is_same(found: Any, expected: Any) -> bool:
 
 
 def load(address: str, clients: int, seconds: float, expected: dict[pathlib.Path, Any]) -> Load:
-    """Let clients ask until the time is over; requests under way are still answered."""
+    """Run clients until the time is over; requests under way are still answered."""
     place = urllib.parse.urlsplit(address)
     bodies = [(path.read_bytes(), answer) for path, answer in expected.items()]
     latencies: list[float] = []
@@ -133,14 +133,14 @@ def load(address: str, clients: int, seconds: float, expected: dict[pathlib.Path
 def table(loads: list[Load], folder: pathlib.Path) -> Table:
     with Map.open(folder) as places:
         config, images = places.config, len(places)
-        what = f"a map of {images} images, {config.descriptor_dim} numbers each"
+        what = f"a map of {images} images, {config.descriptor_dim} dimensions each"
         size = f"images at {config.images_in_words}"
     caption = (
-        f"Clients at once, each a request after the other for {loads[0].seconds:.0f} s; {what}; "
-        f"{size}. Clients and service share the machine: {machine()}. Not as query's: other names, "
-        f"or a similarity off by more than {ROUNDING:g}."
+        f"Concurrent clients, each sending one request after another for {loads[0].seconds:.0f} s; "
+        f"{what}; {size}. Clients and service share the machine: {machine()}. Unlike query: other "
+        f"names, or a similarity that differs by more than {ROUNDING:g}."
     )
-    header = ("clients", "answers", "lost", "not as query's", "answers / s")
+    header = ("clients", "answers", "lost", "unlike query", "answers / s")
     rows = []
     for each in loads:
         quantiles = np.percentile(each.latencies, (50, 95, 99))
@@ -150,7 +150,7 @@ def table(loads: list[Load], folder: pathlib.Path) -> Table:
 
 
 def main() -> None:
-    parser = flags("crisalad serve under load, and what is lost", "docs/serve")
+    parser = flags("Measure crisalad serve under load, and count lost requests.", "docs/serve")
     parser.add_argument("map", type=pathlib.Path)
     parser.add_argument("images", type=pathlib.Path)
     parser.add_argument("--clients", type=count, nargs="+", default=[1, 8, 32])
@@ -158,7 +158,7 @@ def main() -> None:
     arguments = read(parser, "bench_serve")
     expected = expected_answers(arguments.map, arguments.images)
     with served(arguments.map) as address:
-        load(address, 1, 1.0, expected)  # connections and caches warm
+        load(address, 1, 1.0, expected)  # warms connections and caches
         loads = [load(address, one, arguments.seconds, expected) for one in arguments.clients]
     values = [
         {"clients": each.clients, "seconds": each.seconds, "answers": len(each.latencies)}

@@ -1,17 +1,17 @@
-"""Time and memory of the transport, forward and backward, beside torch and ott-jax, in one run.
+"""Measure time and memory of the transport, forward and backward, against torch and ott-jax.
 
     python scripts/bench/bench_sinkhorn.py [--out DIR] [BENCH ...]
 
-Needs torch (the `dev` extra); contenders of ott-jax join in where it is installed. On a GPU if both
-jax and torch find one. Before anything is timed, plans and gradients are checked to be equal, to
-rounding or to what the error that is asked for leaves. Where ott-jax's gradient raises, its
-traceback is printed and the failure counted.
+It needs torch (the `dev` extra); ott-jax is included if it is installed. It runs on a GPU if both
+jax and torch find one. Before anything is timed, plans and gradients are checked to be equal, up to
+rounding or to the requested error. If ott-jax's gradient raises, its traceback is printed and the
+failure counted.
 
-`timing.py` says how they are timed.
+`timing.py` explains how contenders are timed.
 
-Memory is what a call needs at once beyond its inputs and the gradients that it returns. Of jax that
-is what the compiled program sets aside (`temp_size_in_bytes`), of torch the peak of the allocations
-less the releases that its profiler saw (on a GPU: of its allocator's counter).
+Memory is the peak that a call needs beyond its inputs and the gradients that it returns. For jax,
+it is the compiled program's `temp_size_in_bytes`; for torch, the peak of allocations minus releases
+in its profiler (on a GPU, of its allocator's counter).
 """
 
 import argparse
@@ -45,7 +45,7 @@ except ImportError:
 
 DUSTBIN = 1.0
 TOLERANCES = tuple(10 ** (-i / 2) for i in range(2, 15))
-"""Asked for from the loosest on, until the error that is measured is small enough."""
+"""Tried from the loosest on, until the measured error is small enough."""
 MOST_ITERATIONS = 500
 
 
@@ -66,11 +66,11 @@ class Inputs(NamedTuple):
 class Contender(NamedTuple):
     name: str
     call: Callable[[], Any]
-    """Forward and backward, waited for; returns the gradients."""
+    """Runs forward and backward, waits, and returns the gradients."""
     plan: Callable[[], np.ndarray]
     """(images, patches, clusters + 1)."""
     gradient: Callable[[], np.ndarray]
-    """With respect to the scores, in their layout."""
+    """The gradient with respect to the scores, in their layout."""
     memory: Callable[[], int]
     """In bytes."""
 
@@ -79,14 +79,14 @@ LogPlan = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 class Entry(NamedTuple):
-    """Of a program that is compiled once, for inputs of one shape."""
+    """A program that is compiled once, for inputs of one shape."""
 
     name: str
     on: Callable[[Inputs], Contender]
 
 
 def by_jax(name: str, log_plan: LogPlan) -> Entry:
-    """`log_plan` takes scores and the dustbin's score to (images, patches, clusters + 1)."""
+    """Make an entry of `log_plan`, from scores and dustbin score to (images, patches, clusters + 1)."""
 
     def loss(scores: jax.Array, dustbin: jax.Array, weights: jax.Array) -> jax.Array:
         return (weights * jnp.exp(log_plan(scores, dustbin)[..., :-1])).sum()
@@ -131,7 +131,7 @@ def by_ott(name: str, solver: Any) -> Entry:
 
 
 def published(scores: torch.Tensor, dustbin: torch.Tensor, iterations: int) -> torch.Tensor:
-    """SALAD's transport in its layout, (images, clusters + 1, patches): CVPR 2024, Eq. 4 to 6."""
+    """Compute SALAD's transport in its layout, (images, clusters + 1, patches): Eqs. 4 to 6."""
     images, clusters, patches = scores.shape
     full = torch.cat([scores, dustbin.expand(images, 1, patches)], dim=1)
     log_nu = scores.new_zeros(clusters + 1)
@@ -172,7 +172,7 @@ def by_torch(name: str, inputs: Inputs, iterations: int, compiled: bool) -> Cont
 
 
 def check(contenders: list[Contender], tolerance: float = 1e-4) -> None:
-    """Plans and gradients are equal, by default to what rounding of float32 leaves.
+    """Check that plans and gradients are equal, by default up to float32 rounding.
 
     Raises:
         RuntimeError: they are not.
@@ -181,14 +181,14 @@ def check(contenders: list[Contender], tolerance: float = 1e-4) -> None:
         first, *others = ((one.name, getattr(one, part)().astype(np.float64)) for one in contenders)
         for name, found in others:
             off = np.abs(found - first[1]).max() / np.abs(first[1]).max()
-            # 1e-4: hundreds of float32 terms, 3 to 20 iterations deep; another algorithm is off by
+            # 1e-4: hundreds of float32 terms over 3 to 20 iterations; another algorithm differs by
             # 1e-2.
             if not off < tolerance:
                 raise RuntimeError(f"{name}: {part} differs from {first[0]}'s by {off:.1e}")
 
 
 def fixed(arguments: argparse.Namespace) -> Study:
-    """A fixed number of iterations."""
+    """Time a fixed number of iterations."""
     values, rows = [], []
     for iterations, patches in itertools.product(arguments.iterations, arguments.patches):
         inputs = Inputs.random(arguments.images, patches, arguments.clusters, arguments.std, 0)
@@ -203,8 +203,8 @@ def fixed(arguments: argparse.Namespace) -> Study:
             solver = OttSinkhorn(
                 min_iterations=iterations,
                 max_iterations=iterations,
-                # With the default of 10, 3 iterations are none at all; with more than one block
-                # of them, the gradient is wrong.
+                # With the default of 10, 3 iterations would be none at all; with more than one
+                # block of iterations, the gradient is wrong.
                 inner_iterations=iterations,
                 implicit_diff=None,
             )
@@ -239,11 +239,11 @@ def fixed(arguments: argparse.Namespace) -> Study:
         "over ours",
         "time over ours",
     )
-    header = ("k", "N", "contender", "time over ours", "times faster", "MB", "share of MB")
+    header = ("k", "N", "contender", "time relative to ours", "speedup", "MB", "share of MB")
     caption = (
-        f"A fixed number of iterations k, forward and backward, {describe(arguments)}: time over "
-        "that of ours, how many times faster than the better of torch eager and torch.compile, "
-        "memory, and its share of the lesser of those two's."
+        f"A fixed number of iterations k, forward and backward, {describe(arguments)}: time "
+        "relative to ours, speedup over the faster of torch eager and torch.compile, memory, and "
+        "its share of the smaller memory of these two."
     )
     return Study(Table(header, rows, caption, 3), values, figure)
 
@@ -256,7 +256,7 @@ def describe(arguments: argparse.Namespace) -> str:
 
 
 def marginal_error(plan: np.ndarray) -> float:
-    """Largest relative error of a row's or column's mass, measured in float64."""
+    """Measure the largest relative error of a row's or column's mass, in float64."""
     plan = plan.astype(np.float64)
     patches, clusters = plan.shape[1], plan.shape[2] - 1
     masses = np.append(np.ones(clusters), patches - clusters)
@@ -265,7 +265,7 @@ def marginal_error(plan: np.ndarray) -> float:
 
 
 def works(contender: Contender) -> bool:
-    """Whether nothing raises and all numbers of the gradient are finite."""
+    """Return whether nothing raises and the gradient is finite."""
     try:
         return bool(np.isfinite(contender.gradient()).all())
     except RuntimeError:  # jax's own and equinox's
@@ -273,7 +273,7 @@ def works(contender: Contender) -> bool:
 
 
 def converging() -> dict[str, Callable[[float], Entry]]:
-    """By name, the program for a tolerance."""
+    """Return functions from a tolerance to a program, by name."""
 
     def own(name: str, fields: dict[str, Any], tolerance: float) -> Entry:
         config = SinkhornConfig(
@@ -301,7 +301,7 @@ def converging() -> dict[str, Callable[[float], Entry]]:
 
 
 def loosest(program: Callable[[float], Entry], inputs: Inputs, target: float) -> float | None:
-    """The loosest tolerance whose measured error is at most `target`."""
+    """Find the loosest tolerance whose measured error is at most `target`."""
     for tolerance in TOLERANCES:
         if marginal_error(program(tolerance).on(inputs).plan()) <= target:
             return tolerance
@@ -309,7 +309,7 @@ def loosest(program: Callable[[float], Entry], inputs: Inputs, target: float) ->
 
 
 def converged(arguments: argparse.Namespace) -> Study:
-    """To a measured marginal error, with the implicit gradient."""
+    """Time convergence to a measured marginal error, with the implicit gradient."""
     values, rows = [], []
     for target, patches in itertools.product(arguments.errors, arguments.patches):
         batches = [
@@ -328,13 +328,13 @@ def converged(arguments: argparse.Namespace) -> Study:
             working[name] = {i: one for i, one in found.items() if works(one)}
             line |= {"tolerance": tolerance, "failures": len(found) - len(working[name])}
             line["error"] = marginal_error(found[0].plan())
-        # All on one batch: the first on which as many work as on any.
+        # All run on one batch: the first of those on which the most contenders work.
         batch = max(range(len(batches)), key=lambda i: sum(i in one for one in working.values()))
         entered = [one[batch] for one in working.values() if batch in one]
         for one in entered:
             lines[one.name]["error"] = marginal_error(one.plan())
         if entered:
-            # Of sharp plans, gradients move several times as much as masses.
+            # For sharp plans, gradients change several times as much as masses.
             check(entered, 30 * target)
         timed = race({one.name: one.call for one in entered}, arguments.rounds, arguments.calls)
         theirs = [name for name in timed if name.startswith("ott")]
@@ -363,15 +363,15 @@ def converged(arguments: argparse.Namespace) -> Study:
     )
     header = (
         *("error", "N", "contender", "measured"),
-        *("time over ours", "times faster", "MB", "failures"),
+        *("time relative to ours", "speedup", "MB", "failures"),
     )
     caption = (
         "To a measured largest relative marginal error, implicit gradient, forward and backward, "
-        f"{describe(arguments)}. Each is asked for the loosest tolerance, of half decades, that "
-        "reaches the error on the first batch; timed and measured are all on one batch, the first "
-        'on which as many work as on any. "Time over ours": that of plain iterations. "Times '
-        'faster": than the faster ott-jax. "Failures": of '
-        f"{arguments.batches} batches, how many raise or are not finite."
+        f"{describe(arguments)}. Each contender uses the loosest tolerance, in half decades, that "
+        "reaches the error on the first batch; all are timed and measured on one batch, the first "
+        'of those on which the most contenders work. "Time relative to ours": to our plain '
+        'iterations. "Speedup": over the faster ott-jax. "Failures": how many of '
+        f"{arguments.batches} batches raise or are not finite."
     )
     return Study(Table(header, rows, caption, 3), values, figure)
 
@@ -380,7 +380,7 @@ BENCHES = {"bench_fixed": fixed, "bench_converged": converged}
 
 
 def main() -> None:
-    parser = flags("Time the transport; see the top.", "docs/sinkhorn")
+    parser = flags("Time the transport; see the module docstring.", "docs/sinkhorn")
     parser.add_argument("--images", type=count, default=32)
     parser.add_argument("--clusters", type=count, default=64)
     parser.add_argument("--patches", type=count, nargs="+", default=[256, 529])
@@ -389,7 +389,7 @@ def main() -> None:
     parser.add_argument("--std", type=float, default=3.0)
     parser.add_argument("--rounds", type=count, default=5)
     parser.add_argument("--calls", type=count, default=20)
-    parser.add_argument("--batches", type=count, default=8, help="to count failures in")
+    parser.add_argument("--batches", type=count, default=8, help="batches to count failures in")
     arguments = read_some(parser, BENCHES)
     for name in arguments.studies:
         leave(name, BENCHES[name](arguments), arguments)

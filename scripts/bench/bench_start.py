@@ -1,13 +1,13 @@
-"""From nothing to a first descriptor in a file, beside torch: each a program of its own.
+"""Time a new process to its first descriptor in a file, compared with torch.
 
     python scripts/bench/bench_start.py
         [--preset b14 tiny] [--rounds 3]
 
-`crisalad extract` of one photograph, with an empty compile cache (cold) and with what the run
-before left there (warm); and a program that does the same with the reference of the parity checks:
-it imports torch, builds the model, reads weights, describes the image and writes the descriptor,
-eager and through torch.compile, likewise cold and warm. All take turns. The reference takes its
-sizes from this package, whose import, of jax too, does not count for torch.
+It runs `crisalad extract` on one photograph, with an empty compile cache (cold) and with the cache
+of the previous run (warm); and a program that does the same with the reference of the parity
+checks: it imports torch, builds the model, reads weights, describes the image and writes the
+descriptor, eager and with torch.compile, also cold and warm. All take turns. The reference reads
+its sizes from this package; importing the package, and jax with it, is not counted for torch.
 """
 
 import itertools
@@ -54,7 +54,7 @@ NAMES = ("torch eager", "torch.compile, cold", "torch.compile, warm", "ours, col
 
 
 def programs(folder: pathlib.Path, preset: str) -> dict[str, Callable[[], float]]:
-    """What runs each of `NAMES` and returns its seconds, the cold ones with caches of their own."""
+    """Make calls that run each of `NAMES` and return its seconds; cold ones get fresh caches."""
     config = PRESETS[preset]
     image, ours, theirs = (folder / name for name in ("images/a.jpg", "w.safetensors", "w.pth"))
     image.parent.mkdir()
@@ -113,9 +113,9 @@ def main() -> None:
             values.append({"model": preset, "contender": name, "ms": one.rounds, "slower": slower})
             rows.append((preset, name, times(slower)))
     caption = (
-        f"From the start of the program to a descriptor in a file, {measured(arguments.rounds)}."
+        f"From the start of the process to a descriptor in a file, {measured(arguments.rounds)}."
     )
-    table = Table(("model", "program", "time over torch eager's"), rows, caption, 2)
+    table = Table(("model", "program", "time relative to torch eager"), rows, caption, 2)
     figure = bars(values, lambda value: str(value["model"]), "slower", "time over torch eager's")
     leave("bench_start", Study(table, values, figure), arguments)
 

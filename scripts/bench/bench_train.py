@@ -1,16 +1,17 @@
-"""Images trained on a second, beside the same step in torch, in one run.
+"""Measure images per second of a training step, compared with the same step in torch.
 
     python scripts/bench/bench_train.py [--out docs/performance]
         [--presets b14 ...] [--batches 8 16] [--dtypes float32 bfloat16] [--keep]
 
 The step is that of the preset's recipe: the paper's (frozen backbone; adapters and head train), and
-for `tiny` all of the model. It is the whole of it: forward with dropout, mining, loss, backward,
-AdamW. Batches are of 4 images a place. Weights, images and the rest are as in `bench_describe.py`.
+for `tiny` the whole model. It is a complete step: forward with dropout, mining, loss, backward,
+AdamW. Batches have 4 images per place. Weights, images and the rest are as in `bench_describe.py`.
 
-Before anything is timed, losses without dropout are checked to be equal; that 20 steps are, the
-parity checks show. Memory is what a step needs at once beyond what stays between steps, and every
-further device's copy of what trains and of its moments. The operations are counted as twice the
-forward's for what passes the gradient on, and three times for what trains too.
+Before anything is timed, losses without dropout are checked to be equal; the parity checks show the
+same for 20 steps. Memory is the peak that a step needs beyond what stays between steps, plus each
+further device's copy of the trainable parameters and their moments. The operations are counted as
+twice the forward pass for layers that pass the gradient on, and three times for layers that also
+train.
 """
 
 import argparse
@@ -54,7 +55,7 @@ from parity.reference.training import clip_gradients, freeze
 
 IMAGES_PER_PLACE = 4
 LOSS_TOLERANCES = {"float32": 1e-4, "bfloat16": 5e-2}
-"""Relative: similarities off by 1e-6 and 1e-3, times the loss's largest exponent of 50."""
+"""Relative bounds: similarities differ by 1e-6 and 1e-3, times the loss's largest exponent of 50."""
 STEPS = 1000
 """Length of the schedule: longer than any race."""
 
@@ -81,7 +82,7 @@ def torch_step(both: Sides, config: TrainConfig, compiled: bool) -> Contender:
         return loss.item()
 
     def memory() -> int:
-        optimiser.zero_grad()  # or the gradients of the call before would count as freed
+        optimiser.zero_grad()  # otherwise the gradients of the previous call would count as freed
         return torch_memory(call)
 
     return Contender(TORCHES[compiled], call, memory)
@@ -112,7 +113,7 @@ def our_step(both: Sides, config: TrainConfig, spread: bool) -> Contender:
 
 
 def check(both: Sides, config: TrainConfig, tolerance: float) -> None:
-    """The losses without dropout are equal.
+    """Check that the losses without dropout are equal.
 
     Raises:
         RuntimeError: they are not.
@@ -128,11 +129,11 @@ def check(both: Sides, config: TrainConfig, tolerance: float) -> None:
 
 
 def operations(config: TrainConfig, batch: int) -> float:
-    """Of one step, in products alone."""
+    """Count the floating-point operations of one step, products only."""
     total = 0
     for cost in part_costs(config.model, images=batch):
         frozen = config.trainable != "all" and cost.part.startswith("backbone")
-        # Nothing that trains is before the embedding.
+        # Nothing before the embedding trains.
         passes = 1 if frozen and "embedding" in cost.part else 2 if frozen else 3
         total += 2 * batch * passes * cost.macs
     return total

@@ -1,11 +1,11 @@
-"""Descriptors, training steps and starts beside their peers, with each supported version of JAX.
+"""Compare describing, training steps and starts with their peers, on each supported JAX version.
 
     python scripts/bench/bench_versions.py
         [--python OTHER/bin/python ...] [--presets tiny s14 b14] [--rounds 3]
 
-It runs `bench_describe.py`, `bench_train.py` and `bench_start.py` by this interpreter and by each
-other one, in turn, which need the `dev` and `bench` extras. Peers have the versions that pip gave
-each interpreter. `study_compiler.py` compares ours with ours.
+It runs `bench_describe.py`, `bench_train.py` and `bench_start.py` with this interpreter and with
+each other one, in turn; all need the `dev` and `bench` extras. Peers have the versions that pip
+installed for each interpreter. `study_compiler.py` compares our versions with each other.
 """
 
 import json
@@ -27,7 +27,7 @@ STARTS = ("ours, cold", "ours, warm")
 
 
 def run(python: str, bench: str, *options: str) -> list[dict[str, Any]]:
-    """Run a bench by an interpreter; its unrounded numbers."""
+    """Run a bench with an interpreter, and return its unrounded numbers."""
     root = os.pathsep.join([str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")])
     with tempfile.TemporaryDirectory(prefix="bench-versions-") as out:
         command = [python, str(HERE / f"{bench}.py"), "--out", out, *options]
@@ -37,7 +37,7 @@ def run(python: str, bench: str, *options: str) -> list[dict[str, Any]]:
 
 
 def races(bench: str, values: list[dict[str, Any]]) -> dict[str, float]:
-    """Of each race of a bench how many times as fast as the fastest other we are, by medians."""
+    """Return our speedup over the fastest other engine in each race of a bench, by medians."""
     found: dict[str, dict[str, float]] = {}
     for value in values:
         words = [value["model"]]
@@ -84,8 +84,8 @@ def main() -> None:
             rows.append((bench, words, *(f"{each:.2f}" for each in faster.values())))
         header = ("bench", "what", *(f"jax {jax}" for jax in pythons))
         caption = (
-            "How many times as fast as the fastest other (starts: as torch eager), by version of "
-            f"JAX. {processor()}, {usable_cores()} cores; medians of {arguments.rounds} rounds."
+            "Speedup over the fastest other engine (starts: over torch eager), by version of JAX. "
+            f"{processor()}, {usable_cores()} cores; medians of {arguments.rounds} rounds."
         )
         leave("bench_versions", Study(Table(header, rows, caption, 2), values), arguments)
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Compiles b14 for accelerators that are not here, which takes two cores an hour or so, and puts the
-# figures into docs/accelerators/ and its page. In an environment of its own: `pip install -e .[train]
+# Compiles b14 for absent accelerators, which takes about an hour on two cores, and writes the figures
+# and their page to docs/accelerators/. Use a separate environment: `pip install -e .[train]
 # -r scripts/bench/compile_check.txt`.
 set -euo pipefail
 cd "$(dirname "$0")/../.."

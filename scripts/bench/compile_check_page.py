@@ -2,7 +2,7 @@
 
     python scripts/bench/compile_check_page.py [--figures docs/accelerators] [--page PAGE.md]
 
-`compile_check.sh` makes the figures. Machines that are not in them are left out of the page.
+`compile_check.sh` produces the figures. Machines without figures are left out of the page.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from scripts.compile_check.tables import (
 
 FILES = ("compile_check.json", "grown-64.json", "grown-256.json")
 """192 images on every machine; then 24 images a chip on 64 and on 256."""
-# Counted in the same way at commit e070138, where training failed for GPUs with cuDNN's attention.
+# Measured the same way at commit e070138, where training failed for GPUs with cuDNN's attention.
 FAILS = "fails; {} without fused attention"
 BEFORE: Sequence[tuple[str, str, str, str, Callable[[ProgramCheck], float]]] = (
     ("v5e-8 train", "compiler, ms", "77.8", "50", lambda x: 1e3 * (x.compiler or 0)),
@@ -55,12 +55,12 @@ def before_and_after(programs: Mapping[str, ProgramCheck]) -> Table:
         for name, what, before, goal, figure in BEFORE
         if name in programs
     ]
-    caption = "Counted in the same way."
+    caption = "All figures were counted the same way."
     return Table(("program", "figure", "before", "goal", "now"), rows, caption, 2)
 
 
 def scaling(programs: Mapping[str, ProgramCheck]) -> Table:
-    """How much faster more devices train the same batch."""
+    """Tabulate the speedup of more devices on the same batch."""
     rows = []
     for few, many, devices in (
         ("h100", "h100-8", 8),
@@ -83,12 +83,12 @@ def scaling(programs: Mapping[str, ProgramCheck]) -> Table:
                 memory,
             )
         )
-    header = ("machines", "images/s", "times", "of 8 times", "messages", "memory, GB")
+    header = ("machines", "images/s", "speedup", "efficiency", "messages", "memory, GB")
     return Table(header, rows, "Training on 192 images.", 1)
 
 
 def loader(programs: Mapping[str, ProgramCheck], measured: pathlib.Path) -> Table:
-    """How many cores give images as fast as training takes them."""
+    """Tabulate how many cores load images as fast as training consumes them."""
     rates = {
         each["size"]: 1e3 / statistics.median(each["ms"])
         for each in json.loads(measured.read_text())
@@ -103,7 +103,7 @@ def loader(programs: Mapping[str, ProgramCheck], measured: pathlib.Path) -> Tabl
         rows.append((name, f"{rounded(wanted):,}", *cores))
     header = ("machine", "images/s", *(f"cores, {size}" for size in rates))
     words = ", ".join(f"{rate:.0f} from {size}" for size, rate in rates.items())
-    caption = f"Images per second that one core loads: {words}."
+    caption = f"Images per second loaded by one core: {words}."
     return Table(header, rows, caption, 1)
 
 
@@ -123,7 +123,7 @@ def main() -> None:
     versions = read_check(arguments.figures / FILES[0]).versions
     compilers = ", ".join(f"{name} {version}" for name, version in versions.items())
     tables = {
-        "Time and memory": figures(usual, TAKES, f"Of one device ({compilers})."),
+        "Time and memory": figures(usual, TAKES, f"Figures per device ({compilers})."),
         "Operations": figures(usual, MADE_OF, ""),
         "Before and after": before_and_after(by_name),
         "More devices": scaling(by_name),

@@ -1,11 +1,11 @@
-"""Time one program of this package under several options of XLA: a child of `study_compiler.py`.
+"""Time one program under several options of XLA, as a child process of `study_compiler.py`.
 
     python scripts/bench/compiled_by.py '{"work": "describe", "preset": "tiny", "dtype": "float32",
         "batch": 8, "devices": 2, "rounds": 3, "choices": {"defaults": {}}}'
 
-A process of its own, because devices are counted once and because options may end it. The options
-take turns. It prints a line of JSON: for each choice images a second (the median of each round),
-seconds of the first call, and megabytes that the program needs beyond parameters and images.
+It is a separate process because the device count is fixed at start-up and because options may crash
+it. The options take turns. It prints a line of JSON: for each choice, images per second (the median
+of each round), seconds of the first call, and megabytes beyond parameters and images.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 
 SECONDS, CALLS = 2.0, 3
-"""A program is called for that long, and at least that often."""
+"""A program is called for at least that long and that many times."""
 
 
 def describing(batch: int, devices: Any, preset: str, dtype: str) -> tuple[Callable[[], Any], Any]:
-    """What describes a batch of bytes, and the same compiled."""
+    """Make a call that describes a batch of bytes, and one that compiles it."""
     config = dataclasses.replace(PRESETS[preset], compute_dtype=dtype)
     params = devices.replicate(init_crisalad(jax.random.key(0), config))
     images = np.random.default_rng(0).integers(0, 256, (batch, *config.image_size, 3), np.uint8)
@@ -41,7 +41,7 @@ def describing(batch: int, devices: Any, preset: str, dtype: str) -> tuple[Calla
 
 
 def training(batch: int, devices: Any, preset: str, dtype: str) -> tuple[Callable[[], Any], Any]:
-    """What takes a training step of the preset's recipe, and the same compiled."""
+    """Make a call that takes a training step of the preset's recipe, and one that compiles it."""
     config = recipe(preset)
     model = dataclasses.replace(config.model, compute_dtype=dtype)
     step = StepConfig(model, config.loss, config.optimiser, 1000)
@@ -90,7 +90,7 @@ def main(asked: dict[str, Any]) -> None:
 
 
 def given(options: dict[str, Any], **_: Any) -> dict[str, Any]:
-    """In the place of `compiler.compiler_options`."""
+    """Replace `compiler.compiler_options`, and return the options given."""
     return options
 
 

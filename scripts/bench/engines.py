@@ -1,8 +1,8 @@
-"""The engines beside torch that a user would pick instead, and the machine's rate by any of them.
+"""Other inference engines that a user might pick, and the machine's best product rate.
 
-ONNX Runtime and OpenVINO read the ONNX file that torch writes of a model. Both get as many threads
-as there are cores; else they are set as their documents tell who waits for one batch. They need the
-`bench` extra. Where it is not installed, and on a GPU, torch is the only peer.
+ONNX Runtime and OpenVINO read the ONNX file that torch exports. Both get as many threads as there
+are cores; their other settings are those that their documentation recommends for latency. They need
+the `bench` extra. Without it, and on a GPU, torch is the only peer.
 """
 
 import importlib
@@ -33,13 +33,13 @@ from parity.reference.model import Crisalad
 ORT, OPENVINO = "ONNX Runtime", "OpenVINO"
 Run = Callable[[], np.ndarray]
 PRODUCTS = ((2048, 2048, 2048), (2056, 768, 3072))
-"""Rows, width and columns of what tells the machine's rate: square, and `b14`'s widest product."""
-logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it tells what torchvision would add
+"""Sizes of the products that measure the machine's rate: square, and `b14`'s widest."""
+logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports what torchvision would add
 
 
 @contextmanager
 def onnx_file(model: torch.nn.Module, inputs: torch.Tensor) -> Iterator[pathlib.Path]:
-    """An ONNX file of a float32 model for inputs of this shape; weights are beside it."""
+    """Export a float32 model to an ONNX file for inputs of this shape; weights are next to it."""
     with tempfile.TemporaryDirectory(prefix="bench-onnx-") as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch's exporter, about itself
         path = pathlib.Path(folder) / "model.onnx"
@@ -67,7 +67,7 @@ def by_openvino(path: pathlib.Path, inputs: np.ndarray, dtype: str) -> Run:
 
 
 def has_openvino(dtype: str) -> bool:
-    """Whether OpenVINO computes in this type: where it cannot, it takes float32 without a word."""
+    """Return whether OpenVINO computes in this type; otherwise it silently uses float32."""
     if not _installed("openvino"):
         return False
     core = import_openvino().Core()
@@ -75,7 +75,7 @@ def has_openvino(dtype: str) -> bool:
 
 
 def packages() -> list[str]:
-    """The engines' packages that are here, with what makes their files."""
+    """List the installed packages of the engines, with those that make their files."""
     return [name for name in ("onnxruntime", "openvino") if _installed(name)]
 
 
@@ -84,9 +84,9 @@ def _installed(engine: str) -> bool:
 
 
 def readers(dtype: str) -> Mapping[str, Callable[[pathlib.Path, np.ndarray], Run]]:
-    """What makes each engine ready to run an ONNX file in this type, by the engine's name.
+    """Return functions that prepare an ONNX file for each engine in this type, by engine name.
 
-    ONNX Runtime multiplies no bfloat16 numbers on a CPU.
+    ONNX Runtime does not support bfloat16 products on a CPU.
     """
     found: dict[str, Callable[[pathlib.Path, np.ndarray], Run]] = {}
     if torch.cuda.is_available():
@@ -99,15 +99,15 @@ def readers(dtype: str) -> Mapping[str, Callable[[pathlib.Path, np.ndarray], Run
 
 
 class Peer(NamedTuple):
-    """An engine that is ready."""
+    """An engine that is ready to run."""
 
     run: Run
     seconds: float
-    """How long that took, without the writing of the file."""
+    """Seconds to prepare it, without exporting the file."""
 
 
 def peers(model: Crisalad, images: torch.Tensor, dtype: str) -> dict[str, Peer]:
-    """The engines that describe the images with the weights of a reference model, by name."""
+    """Prepare the engines to describe images with the weights of a reference model, by name."""
     found = readers(dtype)
     if not found:
         return {}
@@ -121,7 +121,7 @@ def peers(model: Crisalad, images: torch.Tensor, dtype: str) -> dict[str, Peer]:
 
 
 def product_rate(dtype: str) -> float:
-    """Floating-point operations a second of the fastest product of matrices that any reaches."""
+    """Measure the floating-point operations per second of the fastest matrix product of any engine."""
     best = 0.0
     for rows, width, columns in PRODUCTS:
         timed = race(_products(rows, width, columns, dtype), rounds=3, calls=3)

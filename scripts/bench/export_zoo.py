@@ -32,12 +32,12 @@ MODELS = (
     *("salad-indoor-gb1-10-25", "dinov2-vits14", "dinov2-vitb14-reg4", "dinov3-vits16"),
     *("dinov3-vits16plus", "anyloc-indoor"),
 )
-"""One of each kind; its other sizes have the same operations."""
+"""One model of each kind; its other sizes use the same operations."""
 IMAGES = 3
 
 
 def config_of(name: str) -> ModelConfig:
-    """The configuration of a preset, or of a published model by the shapes of its file."""
+    """Return the configuration of a preset, or of a published model by the shapes in its file."""
     if name in PRESETS:
         return PRESETS[name]
     sys.path.insert(0, str(ROOT))
@@ -49,7 +49,7 @@ def config_of(name: str) -> ModelConfig:
 def difference(
     folder: pathlib.Path, params: Crisalad, config: ModelConfig, how: ExportConfig
 ) -> float:
-    """The largest difference of a format's descriptors, or InputError where it cannot hold it."""
+    """Measure the largest difference of a format's descriptors; raise InputError if unsupported."""
     manifest = write_export(folder, Model(params, config), how)
     if how.format != "stablehlo":
         return manifest["checked"]["largest_difference"]
@@ -69,7 +69,7 @@ def difference(
 
 
 def row(name: str) -> list[str]:
-    """A line of the table: the model, its size, and each format under each grouping."""
+    """Make a table row: the model, its size, and each format under each grouping."""
     config = config_of(name)
     params = init_crisalad(jax.random.key(0), config)
     cells = [name, " x ".join(map(str, config.input_size)), str(config.descriptor_dim)]
@@ -100,7 +100,7 @@ def main() -> None:
         gc.collect()
     formats = [f"{each}, {grouping}" for grouping in ("single", "batch") for each in FORMATS]
     header = "model", "images", "dimensions", *formats
-    caption = "Largest difference of any dimension of a few descriptors from those of `describe`."
+    caption = "Largest difference in any dimension of a few descriptors from those of `describe`."
     leave("zoo", Study(Table(header, rows, caption, 2), rows), given)
 
 

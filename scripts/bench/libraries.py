@@ -1,4 +1,4 @@
-"""Options of XLA that choose the library of a CPU's matrix products, on jax 0.10 and 0.12."""
+"""XLA options that choose the library for matrix products on a CPU, in jax 0.10 and 0.12."""
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 LIBRARIES: dict[str, dict[str, bool | str]] = {
@@ -10,6 +10,6 @@ LIBRARIES: dict[str, dict[str, bool | str]] = {
         "xla_cpu_use_onednn": True,
         "xla_cpu_experimental_onednn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
     },
-    # Single products, where jaxlib's defaults give YNN whole attentions too.
+    # Single products, whereas jaxlib's defaults also give YNN whole attentions.
     "YNN": {_FUSIONS: "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"},
 }

@@ -1,11 +1,12 @@
-"""What a model gains at a place by `crisalad adapt`, and what it loses elsewhere.
+"""Measure what a model gains at a place by `crisalad adapt`, and what it loses elsewhere.
 
     python scripts/bench/study_adapt.py --data SET... [--weights FILE] [--seeds 3] [--frames 3]
         [--trainable head] [--learning-rate 1e-3] [--epochs 10]
 
 The database of each set becomes a map, to which the model is adapted once for each seed. Its
-queries, which no step has seen, ask before and after, and so do those of the other sets. Intervals
-are the paired bootstrap's over queries and seeds, of 95 %. `--frames` is of sets without positions.
+queries, unseen in training, are evaluated before and after, and so are those of the other sets.
+Intervals are 95 % paired bootstrap intervals over queries and seeds. `--frames` is for sets without
+positions.
 """
 
 import argparse
@@ -31,14 +32,14 @@ QUIET = Reading(quiet=True)
 
 
 def firsts(model: Model, data: Benchmark) -> np.ndarray:
-    """Whether each query's first answer is right."""
+    """Return whether each query's first answer is correct."""
     (result,) = evaluate(model, data, groupings=["single"], reading=QUIET)
     assert result.firsts is not None
     return result.firsts[0]
 
 
 def adapted(model: Model, data: Benchmark, seed: int, given: argparse.Namespace) -> Model | None:
-    """Adapt a model to the database of a set; None where held-out frames gain nothing."""
+    """Adapt a model to the database of a set; return None if held-out frames gain nothing."""
     config = recipe("b14", "adapt", model=model.config)
     rate = given.learning_rate or config.optimiser.learning_rate
     config = dataclasses.replace(
@@ -82,7 +83,7 @@ def main() -> None:
     given = parser.parse_args()
     model, sets = load(given.weights), [open_benchmark(each) for each in given.data]
     before = {data.name: firsts(model, data) for data in sets}
-    print("| adapted to | asked | R@1 before | change of R@1 |\n| --- | --- | ---: | ---: |")
+    print("| adapted to | evaluated on | R@1 before | change of R@1 |\n| --- | --- | ---: | ---: |")
     for data in sets:
         models = [adapted(model, data, seed, given) or model for seed in range(given.seeds)]
         for asked in sorted(sets, key=lambda each: each is not data):

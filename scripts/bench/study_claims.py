@@ -1,12 +1,12 @@
-"""Tables of what is claimed and how it was measured, for `docs/claims.md` and the README.
+"""Tabulate claimed recalls and how they were measured, for `docs/claims.md` and the README.
 
     python scripts/bench/study_claims.py [claims] [models] [leakage]
 
-claims: every row of `docs/claims/claims.toml`. models: licence, length and parameters of the same
-from the table of published models, and the speed that `bench_claims.py` measured. leakage: what
-images in a batch tell under the published evaluations of models whose images attend to each other,
-computed from their rules alone: which frames are right, in which order they come, how many are in a
-batch.
+claims: every row of `docs/claims/claims.toml`. models: their licence, descriptor length and
+parameters from the table of published models, and the speed that `bench_claims.py` measured.
+leakage: the information that leaks between images of a batch in the published evaluations of models
+whose images attend to each other, computed only from their rules: which frames are correct, in which
+order they come, and how many are in a batch.
 """
 
 import json
@@ -38,7 +38,7 @@ def rows() -> list[dict[str, Any]]:
 
 
 def recall(row: dict[str, Any], name: str) -> str:
-    """The printed recall on a set; of Nordland also those of other splits, with a mark."""
+    """Format the printed recall on a set; for Nordland also those of other splits, marked."""
     found = [f"{row[name]:.1f}"] if name in row else []
     if name == "nordland":
         found += [f"{row['nordland_bench']:.1f}*"] if "nordland_bench" in row else []
@@ -47,7 +47,7 @@ def recall(row: dict[str, Any], name: str) -> str:
 
 
 def facts(row: dict[str, Any], speeds: dict[str, float]) -> tuple[str, str, str, str]:
-    """Licence, length of a descriptor, millions of parameters, and images a second."""
+    """Return licence, descriptor length, millions of parameters, and relative speed."""
     if "models" not in row:
         return DASH, f"{row['descriptor']:,}", DASH, DASH
     model = PUBLISHED[row["models"][0]]
@@ -60,7 +60,7 @@ def facts(row: dict[str, Any], speeds: dict[str, float]) -> tuple[str, str, str,
 
 
 def command(row: dict[str, Any]) -> str:
-    """What reproduces a row, after `crisalad evaluate --data SET`."""
+    """Return the arguments after `crisalad evaluate --data SET` that reproduce a row."""
     if "command" in row:
         return f"`{row['command']}`"
     words = [f"--weights {' | '.join(row['models'])}", *([row["flags"]] if "flags" in row else [])]
@@ -68,7 +68,7 @@ def command(row: dict[str, Any]) -> str:
 
 
 def claims() -> Study:
-    """What is printed, and how it was measured."""
+    """Tabulate printed recalls, and how they were measured."""
     header = ("model", "measured", "printed in", *HEADERS)
     found = [
         (row["title"], row["how"], row["source"], *(recall(row, name) for name in SETS))
@@ -76,33 +76,33 @@ def claims() -> Study:
     ]
     caption = (
         "R@1 in percent, as printed. \\* VPR-Bench's lists of Nordland; † another split, see "
-        '"measured", which begins with the size of images.'
+        '"measured", which begins with the image size.'
     )
     return Study(Table(header, found, caption, 3), found)
 
 
 def measured() -> dict[str, Any]:
-    """What `bench_claims.py` measured; nothing where it was not run."""
+    """Read what `bench_claims.py` measured; empty if it has not run."""
     path = FOLDER / "speed.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
 def models() -> Study:
-    """What a model costs, and the command that repeats its row."""
+    """Tabulate what each model costs, and the command that reproduces its row."""
     speed = measured()
     speeds = speed.get("times_megaloc", {})
-    header = ("model", "reproduces", "licence", "numbers", "million parameters", "speed")
+    header = ("model", "reproduces", "licence", "dimensions", "million parameters", "speed")
     found = [(row["title"], command(row), *facts(row, speeds)) for row in rows()]
     device = f" on one {speed['device']}" if speed else ""
     caption = (
-        f"Speed: images described a second{device}, as a multiple of MegaLoc's, at its own image "
-        "size, in bfloat16. The second column follows `crisalad evaluate --data SET`."
+        f"Speed: images described per second{device}, as a multiple of MegaLoc's, at the model's "
+        "image size, in bfloat16. Append the second column to `crisalad evaluate --data SET`."
     )
     return Study(Table(header, found, caption, 3), found)
 
 
 def best() -> str:
-    """The rows with the highest mean of Pitts30k and MSLS, for independent images, and speeds."""
+    """List the rows with the highest mean of Pitts30k and MSLS for independent images, with speeds."""
     speeds = measured()["images_per_second"]
     alone = [
         row
@@ -124,7 +124,7 @@ def best() -> str:
 
 
 class Rules(NamedTuple):
-    """A set as its evaluation has it: where images are, in any unit, in the order of names."""
+    """A set as in its evaluation: the positions of images, in any unit, in the order of names."""
 
     name: str
     queries: np.ndarray
@@ -141,11 +141,11 @@ class Rules(NamedTuple):
 
 
 def known_rules() -> list[Rules]:
-    """Sets whose rules alone say which images come next to each other.
+    """Return the sets whose rules alone determine which images come next to each other.
 
-    Nordland: frame i of winter is right for frames i - 10 to i + 10 of summer. SPED and AmsterTime:
-    one image for each. Pitts30k: 24 views of a panorama have one position, by which names are
-    sorted; panoramas are taken to be further apart than 25 m, so that the shares are the least.
+    Nordland: winter frame i is correct for summer frames i - 10 to i + 10. SPED and AmsterTime: one
+    image for each. Pitts30k: the 24 views of a panorama share one position, by which names are
+    sorted; panoramas are assumed to be more than 25 m apart, so the shares are lower bounds.
     """
     frames = np.arange(27_592.0)
     return [
@@ -190,10 +190,10 @@ def leakage() -> Study:
                 cells = (DASH if each is None else f"{100 * each:.1f}" for each in row)
                 of = ", ".join(methods) if grouping == "sequential" else ""
                 found.append((rules.name, str(size), grouping, of, *cells))
-    header = ("set", "images", "batches", "of", "same place, queries", "database", "mirrored")
+    header = ("set", "images", "batches", "used by", "same place, queries", "database", "mirrored")
     caption = (
-        "Percent of the other images in a batch: those of an image's own place, and those whose "
-        "place is also in the batch of the query's right answer."
+        "Percent of the other images in a batch: those that show an image's own place, and those "
+        "whose place is also in the batch of the query's correct answer."
     )
     return Study(Table(header, found, caption, 4), values)
 
@@ -202,7 +202,7 @@ STUDIES = {"claims": claims, "models": models, "leakage": leakage}
 
 
 def main() -> None:
-    arguments = read_some(flags("Tabulate; see the top.", "docs/claims"), STUDIES)
+    arguments = read_some(flags("Tabulate claimed recalls.", "docs/claims"), STUDIES)
     for name in arguments.studies:
         leave(name, STUDIES[name](), arguments)
     if "claims" in arguments.studies:

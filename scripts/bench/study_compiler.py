@@ -1,13 +1,13 @@
-"""What XLA's options are worth on each supported version of JAX: which exist, help, or crash.
+"""Test XLA's options on each supported version of JAX: which exist, help, or crash.
 
     python scripts/bench/study_compiler.py
         [--python OTHER/bin/python ...] [--rounds 3] [--cases "describe b14 float32 8 2" ...]
 
-Each program is compiled and timed in a process of its own (`compiled_by.py`) with each library's
-matrix products, and with other options that helped some program or version. The package takes the
-defaults, and to describe the order of the least memory. The versions of JAX are those of the
-interpreters given, one after the other. Where options end the process, each is tried by itself, and
-tabled as the signal that ended it; an option that a version lacks is tabled as absent.
+Each program is compiled and timed in a separate process (`compiled_by.py`) with each library for
+matrix products, and with other options that helped some program or version. The package uses the
+defaults, and for describing the schedule with the least memory. The versions of JAX are those of
+the given interpreters, one after another. If options crash the process, each is tried on its own,
+and the table shows the signal that ended it; an option that a version lacks is shown as absent.
 """
 
 import json
@@ -63,7 +63,7 @@ CASES = [
 
 
 def run(python: str, case: Program, choices: dict[str, Any], rounds: int) -> dict[str, Any]:
-    """What `compiled_by.py` found of each choice; `failed` instead of what ended its process."""
+    """Run `compiled_by.py`, and return its results by choice; `failed` for those that crashed it."""
     asked = json.dumps(case._asdict() | {"choices": choices, "rounds": rounds})
     path = os.pathsep.join([str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
@@ -114,10 +114,10 @@ def main() -> None:
             cells = (cell(runs[name], best[jax]) for jax, runs in found.items())
             rows.append((words, name, *cells))
         rows.append(
-            (words, "images a second, of the fastest", *(f"{b:.3g}" for b in best.values()))
+            (words, "images per second of the fastest", *(f"{b:.3g}" for b in best.values()))
         )
     caption = (
-        "Programs by options of XLA and version of JAX: speed over the fastest options, seconds of "
+        "Programs by XLA options and JAX version: speed relative to the fastest options, seconds of "
         f"the first call, MB. {processor()}, {CORES} cores; medians of {arguments.rounds} rounds."
     )
     table = Table(("program", "options", *(f"jax {v}" for v in versions)), rows, caption, 2)

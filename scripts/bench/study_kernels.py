@@ -1,10 +1,10 @@
-"""Compare JAX's attention kernels for TPUs with ours by libtpu's estimate; nothing is executed.
+"""Compare JAX's attention kernels for TPUs with ours by libtpu's estimates, without running them.
 
     python scripts/bench/study_kernels.py [--target v5e-1] [--program describe] [--images 192]
 
-`b14` in bfloat16 is compiled with each kernel in the place of ours, and libtpu's estimate is read
-as `scripts.compile_check` reads it, whose requirements this has. JAX's kernels take whole blocks of
-128 tokens with the heads in front, so that 257 tokens are padded to 384.
+`b14` in bfloat16 is compiled with each kernel in place of ours, and libtpu's estimate is read in the
+same way as in `scripts.compile_check`, with the same requirements. JAX's kernels take whole blocks
+of 128 tokens with the head axis first, so 257 tokens are padded to 384.
 """
 
 import argparse
@@ -30,7 +30,7 @@ BLOCK = 128
 
 
 def flash(qkv: Array, heads: int, length: int, *_: Any) -> Array:
-    """Attend as `attention_pallas.attend`, by JAX's flash attention."""
+    """Attend like `attention_pallas.attend`, with JAX's flash attention."""
     from jax.experimental.pallas.ops.tpu import flash_attention as kernels
 
     padded, queries, keys, values = _heads_first(qkv, heads)
@@ -39,7 +39,7 @@ def flash(qkv: Array, heads: int, length: int, *_: Any) -> Array:
         queries,
         keys,
         values,
-        # Padding attends to padding alone.
+        # Padding attends only to padding.
         segment_ids=kernels.SegmentIds(valid, valid),
         sm_scale=queries.shape[-1] ** -0.5,
         block_sizes=_flash_blocks(kernels.BlockSizes, padded),
@@ -48,7 +48,7 @@ def flash(qkv: Array, heads: int, length: int, *_: Any) -> Array:
 
 
 def splash(qkv: Array, heads: int, length: int, *_: Any) -> Array:
-    """Attend as `attention_pallas.attend`, by JAX's splash attention."""
+    """Attend like `attention_pallas.attend`, with JAX's splash attention."""
     from jax.experimental.pallas.ops.tpu.splash_attention import splash_attention_kernel as kernels
     from jax.experimental.pallas.ops.tpu.splash_attention import splash_attention_mask as masks
 
@@ -82,7 +82,7 @@ def _side_by_side(mixed: Array, qkv: Array) -> Array:
 
 
 def _flash_blocks(blocks: Any, padded: int) -> Any:
-    """Take all tokens of an image at once, as ours; the batch one by one."""
+    """Take all tokens of an image at once, as ours does, and one image of the batch at a time."""
     names = ("block_q", "block_k_major", "block_k")
     names += ("block_q_major_dkv", "block_k_major_dkv", "block_k_dkv", "block_q_dkv")
     names += ("block_k_major_dq", "block_k_dq", "block_q_dq")
@@ -106,7 +106,7 @@ def main() -> None:
     given = parser.parse_args()
     compile_on_cpu()
     config = recipe("b14")
-    # JAX's kernels multiply bfloat16 at no other precision.
+    # JAX's kernels support no other precision for bfloat16.
     model = dataclasses.replace(config.model, compute_dtype="bfloat16", precision="default")
     config = dataclasses.replace(config, model=model)
     fits = attention_pallas.fits

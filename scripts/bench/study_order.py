@@ -1,12 +1,12 @@
-"""How much of a cross-image model's recall is the order of the files.
+"""Measure how much of a cross-image model's recall comes from the order of the files.
 
     python scripts/bench/study_order.py --runs RUNS [--seeds 0 1 2]
 
 Small networks with CriSALAD's encoder, with SAGE's, and without one are trained on rendered places,
-as in `study_small.py`, whose runs are gone on with. They are asked on 400 other places, stations of
+as in `study_small.py`, whose runs are resumed. They are evaluated on 400 other places, stations of
 streets, corridors and country in the order in which a drive passes them; queries and database are
-in the same order, as the frames of Nordland are. No two images of a side show the same place, so
-that nothing leaks but the order. Batches have the sizes of SAGE's evaluation.
+in the same order, like the frames of Nordland. No two images of a side show the same place, so only
+the order can leak. Batches have the sizes of SAGE's evaluation.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ KS = (1, 5)
 
 
 def with_sage(config: TrainConfig) -> TrainConfig:
-    """The same with SAGE's encoder, as large as that of `tiny`."""
+    """Use SAGE's encoder, with the size of `tiny`'s, in a configuration."""
     encoder = SageCrossImageConfig(heads=4, feedforward=128, dropout=0.0, width=96)
     model = dataclasses.replace(config.model, cross_image=encoder)
     return dataclasses.replace(config, model=model)
@@ -51,7 +51,7 @@ def groupings() -> list[str]:
 
 
 def ask(arm: Arm, seed: int, runs: pathlib.Path) -> dict[str, dict[int, float]]:
-    """Recalls in percent by grouping and K; and, of the order, how far batches mirror."""
+    """Evaluate a trained arm, and return its recalls in percent by grouping and K."""
     asked = open_asked(runs / "worlds" / named(WorldConfig()) / "test")
     model = trained(arm, seed, runs)
     names = groupings() if model.config.cross_image.attends else ["single"]
@@ -63,7 +63,7 @@ def ask(arm: Arm, seed: int, runs: pathlib.Path) -> dict[str, dict[int, float]]:
 
 
 def study_of(results: dict[str, list[dict[str, dict[int, float]]]]) -> Study:
-    """A row an encoder and grouping; what the order gives is over batches as large, shuffled."""
+    """Tabulate encoders and groupings, with differences to shuffled batches of the same size."""
     rows = []
     for label, runs in results.items():
         for grouping in runs[0]:
@@ -82,16 +82,16 @@ def study_of(results: dict[str, list[dict[str, dict[int, float]]]]) -> Study:
     for k in KS:
         header += [f"R@{k}", "over single", "over shuffled"]
     caption = (
-        "Mean recall in percent of 400 rendered places, and points over the same images alone and "
-        "over batches as large in random order; of runs with the same seeds, with the 95 % "
-        "interval by Student's t over seeds."
+        "Mean recall in percent on 400 rendered places, and the difference in points to single "
+        "images and to shuffled batches of the same size, for runs with the same seeds, with the "
+        "95 % interval by Student's t over seeds."
     )
     return Study(Table(tuple(header), rows, caption, 3), results)
 
 
 def main() -> None:
-    parser = flags("Train and tabulate; see the top.", "docs/claims")
-    parser.add_argument("--runs", type=pathlib.Path, required=True, help="where trainings are kept")
+    parser = flags("Train and tabulate; see the module docstring.", "docs/claims")
+    parser.add_argument("--runs", type=pathlib.Path, required=True, help="folder for the trainings")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     arguments = read(parser, "order")
     write_world(arguments.runs / "worlds" / named(WorldConfig()), WorldConfig())

@@ -1,9 +1,10 @@
-"""Train `tiny` from scratch on small real photographs, and tabulate what encoder and adapter bring.
+"""Train `tiny` from scratch on small real photographs, and tabulate the effect of two parts.
 
     python scripts/bench/study_photographs.py --data DIR --out OUT
 
 DIR holds `sped_train` (GSV-Cities layout), `sped_val` (@UTM layout) and `corridor` (VPR-Bench
-layout). Runs that OUT already holds are gone on with. The tables are written to OUT/photographs.md.
+layout). The parts are the encoder and the adapter. Runs in OUT are resumed. The tables are written
+to OUT/photographs.md.
 """
 
 import argparse
@@ -32,7 +33,7 @@ TESTS = ("sped_val", "corridor")
 
 
 def variants() -> dict[str, TrainConfig]:
-    """The whole model, and two with one field changed."""
+    """Return the whole model, and two with one field changed."""
     whole = recipe("tiny")
     model = whole.model
     no_encoder = dataclasses.replace(model, cross_image="none")
@@ -48,7 +49,7 @@ def variants() -> dict[str, TrainConfig]:
 def train(
     name: str, config: TrainConfig, data: pathlib.Path, out: pathlib.Path
 ) -> tuple[Crisalad, float]:
-    """The trained model, and how long its training took; a finished run is read, not repeated."""
+    """Train a model, and return it with its training time; a finished run is only read."""
     folder = out / f"{name.replace(' ', '_')}_seed{config.seed}"
     timing = out / f"{folder.name}.json"
     started = time.monotonic()
@@ -64,12 +65,18 @@ def hog_recalls(benchmark: Benchmark) -> Mapping[int, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Train and tabulate; see the top.")
+    parser = argparse.ArgumentParser(description="Train and tabulate; see the module docstring.")
     parser.add_argument("--data", type=pathlib.Path, required=True)
     parser.add_argument("--out", type=pathlib.Path, required=True)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="of the whole model")
     parser.add_argument(
-        "--ablation-seeds", type=int, nargs="*", default=[0], help="of those with one field changed"
+        "--seeds", type=int, nargs="+", default=[0, 1], help="seeds of the whole model"
+    )
+    parser.add_argument(
+        "--ablation-seeds",
+        type=int,
+        nargs="*",
+        default=[0],
+        help="seeds of models with one field changed",
     )
     arguments = parser.parse_args()
     benchmarks = [open_benchmark(arguments.data / name) for name in TESTS]

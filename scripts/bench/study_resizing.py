@@ -1,9 +1,9 @@
-"""How far a descriptor moves when another library decodes and resizes the photograph.
+"""Measure how far a descriptor moves when another library decodes and resizes the photograph.
 
     python scripts/bench/study_resizing.py --images FOLDER [--weights FILE | --preset tiny]
 
 Each photograph is described after `read_image` and `prepare_image`, and after Pillow's and OpenCV's
-own ways to the same size. The table has cosines and distances of the unit descriptors.
+own resizing to the same size. The table shows cosines and distances of the unit descriptors.
 """
 
 import argparse
@@ -46,7 +46,7 @@ WAYS: Mapping[str, Resize] = {
 
 
 def rows(model: Model, paths: list[pathlib.Path]) -> list[tuple[str, ...]]:
-    """Return a line for each of `WAYS`: cosines (median, least) and distances (median, most)."""
+    """Return a row for each of `WAYS`: cosines (median, min) and distances (median, max)."""
     ours = describe_images(model, [read_image(path) for path in paths])
     lines = []
     for name, way in WAYS.items():
@@ -73,7 +73,7 @@ def main() -> None:
         model, name = load(given.weights), given.weights
     paths = list_images(given.images)[: given.most]
     print(f"{name}: {len(paths)} photographs, resized to {model.config.image_size}\n")
-    header = ("resized by", "cosine, median", "least", "distance, median", "most")
+    header = ("resized by", "cosine, median", "smallest", "distance, median", "largest")
     for cells in (header, ("---", *["---:"] * 4), *rows(model, paths)):
         print(f"| {' | '.join(cells)} |")
 

@@ -1,4 +1,4 @@
-"""Recall of one model by each runtime, in float32 and in fewer bits, on photographs.
+"""Measure recall of one model with each runtime, in float32 and lower precision.
 
     python scripts/bench/study_runtimes.py --weights FILE --data SET... --int8 PHOTOGRAPHS
 
@@ -35,7 +35,7 @@ ENGINES: tuple[tuple[EngineName, ExportConfig], ...] = (
 def models(
     weights: pathlib.Path, photographs: pathlib.Path, folder: pathlib.Path
 ) -> Iterator[tuple[str, Model | Runtime]]:
-    """The model by each runtime, with its name in the table; JAX's in float32 is the first."""
+    """Yield the model in each runtime with its name in the table; JAX in float32 comes first."""
     model = load_weights(weights)
     yield "JAX, float32", model
     bfloat16 = dataclasses.replace(model.config, compute_dtype="bfloat16")
@@ -51,7 +51,7 @@ def models(
 
 
 def first_answers(model: Model | Runtime, data: Benchmark) -> np.ndarray:
-    """The numbers of the images most similar to each query, best first."""
+    """Return the indices of the images most similar to each query, best first."""
     there, asked = (
         np.asarray(extract(model, paths, reading=Reading(quiet=True)).descriptors)
         for paths in (data.database, data.queries)
@@ -60,7 +60,7 @@ def first_answers(model: Model | Runtime, data: Benchmark) -> np.ndarray:
 
 
 def recalls(answers: np.ndarray, data: Benchmark) -> list[float]:
-    """Share of queries, of those with a positive, that have one among their first answers."""
+    """Return the share of queries with a positive that have one among their first answers."""
     right = [(a, set(p)) for a, p in zip(answers, data.ground_truth(), strict=True) if len(p)]
     return [100 * float(np.mean([not p.isdisjoint(a[:k]) for a, p in right])) for k in KS]
 
@@ -87,7 +87,7 @@ def main() -> None:
                 cells.append(f"{int((found[:, 0] == first[:, 0]).sum())} of {len(found)}")
             rows.append(tuple(cells))
             print(*cells, sep="  ", file=sys.stderr, flush=True)
-    caption = "Same: the queries whose first answer is the same as in float32 with JAX."
+    caption = "Same: the queries whose first answer is the same as with JAX in float32."
     leave("runtimes", Study(Table(tuple(header), rows, caption), rows), given)
 
 

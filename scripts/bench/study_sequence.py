@@ -1,11 +1,11 @@
-"""Measure what a filter over consecutive frames gains over single frames, on sets of frames.
+"""Measure the gain of a filter over consecutive frames compared with single frames.
 
     python scripts/bench/study_sequence.py --data SET ... --weights W.safetensors ... --out OUT
 
-Each SET is one that `crisalad evaluate` reads, whose database and queries are in the order of the
-camera's way. `--frames N` and `--layout folders` are for two plain folders of the same moments.
-`--street` adds a street that is rendered: 16 places of 8 frames, 2 m apart, once at noon in summer
-and once at dusk in autumn. Every model describes images alone; HOG needs no weights.
+Each SET is one that `crisalad evaluate` reads, with database and queries in the order of the
+camera's path. `--frames N` and `--layout folders` are for two plain folders of the same moments.
+`--street` adds a rendered street: 16 places of 8 frames, 2 m apart, once at noon in summer and once
+at dusk in autumn. Every model describes images independently; HOG needs no weights.
 """
 
 import argparse
@@ -33,7 +33,7 @@ FILTERS = {
     "sharpness 1": BayesFilter(sharpness=1),
     "sharpness 4": BayesFilter(sharpness=4),
 }
-"""The filter as it is by default, and with one setting changed."""
+"""The filter with its defaults, and with one setting changed."""
 
 Sides = tuple[Float[np.ndarray, "database d"], Float[np.ndarray, "query d"]]
 
@@ -82,7 +82,7 @@ def descriptors(benchmark: Benchmark, weights: list[pathlib.Path]) -> Iterator[t
 
 
 SURE = 0.4
-"""Share of the frames that are most similar to an image of the map."""
+"""Share of frames that counts as the surest: those most similar to an image of the map."""
 
 
 def measure(benchmark: Benchmark, sides: Sides) -> dict[str, float]:
@@ -116,19 +116,19 @@ def study(benchmarks: list[Benchmark], weights: list[pathlib.Path]) -> Study:
             name = f"{benchmark.root.name}, {len(benchmark.queries)} frames"
             rows.append((name, model, *(gain if c == "gain" else cells[c] for c in columns)))
     caption = (
-        "Recall@1 in percent: of single frames, of the filter as it is by default, and the gain; "
-        "reversed: of the filter, asked from the last frame to the first; "
-        f"surest: of the {100 * SURE:.0f} % of the frames to which some image is most similar; "
-        "then of the filter with one setting changed."
+        "Recall@1 in percent: single frames, the filter with its defaults, and the gain; "
+        "reversed: the filter, from the last frame to the first; "
+        f"surest: the {100 * SURE:.0f} % of frames that are most similar to an image of the map; "
+        "then the filter with one setting changed."
     )
     return Study(Table(("set", "model", *columns), rows, caption, 2), values)
 
 
 def main() -> None:
-    parser = flags("Measure and tabulate; see the top.", "docs/maps")
+    parser = flags("Measure and tabulate; see the module docstring.", "docs/maps")
     parser.add_argument("--data", type=pathlib.Path, nargs="*", default=[], help="sets of frames")
-    parser.add_argument("--layout", help="as of crisalad evaluate, for all of --data")
-    parser.add_argument("--frames", type=int, help="how many frames a positive may be away")
+    parser.add_argument("--layout", help="layout of all sets in --data, as in crisalad evaluate")
+    parser.add_argument("--frames", type=int, help="largest distance of a positive in frames")
     parser.add_argument("--street", type=pathlib.Path, help="folder for a rendered street")
     parser.add_argument("--weights", type=pathlib.Path, nargs="*", default=[], help="models")
     arguments: argparse.Namespace = read(parser, "sequence")

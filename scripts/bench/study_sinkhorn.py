@@ -2,9 +2,9 @@
 
     python scripts/bench/study_sinkhorn.py [--out DIR] [STUDY ...]
 
-Two kinds of scores, of a batch of images each: "iid", independent Gaussians; "lowrank", inner
-products of rank 4 plus a bias per cluster, nearer to what a network makes. Each is scaled to a
-standard deviation. About two minutes on two cores.
+There are two kinds of scores, each for a batch of images: "iid", independent Gaussians; "lowrank",
+inner products of rank 4 plus a bias per cluster, closer to the output of a network. Each is scaled
+to a standard deviation. It takes a few minutes.
 """
 
 import dataclasses
@@ -44,18 +44,18 @@ class Size(NamedTuple):
     patches: int = 256
     clusters: int = 64
     limit: int = 2000
-    """Most iterations to wait for a tolerance."""
+    """Maximum number of iterations to reach a tolerance."""
 
 
 def scores_of(kind: str, scale: float, size: Size, seed: int = 0) -> np.ndarray:
-    """Scores (images, patches, clusters) in float64 of standard deviation `scale`."""
+    """Draw scores (images, patches, clusters) in float64 with standard deviation `scale`."""
     generator = np.random.default_rng(seed)
     shape = (size.images, size.patches, size.clusters)
     if kind == "iid":
         return scale * generator.standard_normal(shape)
     patches = generator.standard_normal((size.images, size.patches, 4))
     clusters = generator.standard_normal((size.clusters, 4))
-    # Half as much from the bias as from the products, whose standard deviation is 2.
+    # The bias contributes half as much as the products, whose standard deviation is 2.
     scores = patches @ clusters.T + generator.standard_normal(size.clusters)
     return scale * scores / scores.std()
 
@@ -67,7 +67,7 @@ def cases(size: Size) -> Iterator[tuple[str, float, jax.Array]]:
 
 
 def solve_published(scores: jax.Array, config: SinkhornConfig = PUBLISHED) -> SinkhornResult:
-    """With a column of zeros for the dustbin, as published."""
+    """Solve with a column of zeros for the dustbin, as published."""
     marginals = log_marginals(*scores.shape[-2:], dtype=scores.dtype)
     full = append_dustbin(scores, jnp.zeros((), scores.dtype))
     return solve(full, *marginals, config=config)
@@ -79,7 +79,7 @@ def middle_and_most(values: Any) -> tuple[float, float]:
 
 
 def error(size: Size) -> Study:
-    """Marginal error against the number of iterations."""
+    """Tabulate the marginal error against the number of iterations."""
     counts = [k for k in (1, 2, 3, 5, 10, 20, 50, 100) if k <= size.limit]
     values = []
     for kind, scale, scores in cases(size):
@@ -96,7 +96,7 @@ def error(size: Size) -> Study:
             line = [v for v in values if (v["kind"], v["std"]) == (kind, scale)]
             cells = (f"{number(v['median'])} ({number(v['largest'])})" for v in line)
             rows.append((kind, f"{scale:g}", *cells))
-            # Float64's last place, where a line ends and noise begins.
+            # The last place of float64, below which there is only noise.
             middle, most = (
                 np.maximum([v[name] for v in line], 1e-15) for name in ("median", "largest")
             )
@@ -115,7 +115,7 @@ def error(size: Size) -> Study:
 
 
 def mass(size: Size) -> Study:
-    """Masses of the clusters, each of which should be 1, after the published iterations."""
+    """Tabulate the cluster masses, which should be 1, after the published iterations."""
     values, rows, masses = [], [], []
     for kind, scale, scores in cases(size):
         plan = jnp.exp(solve_published(scores, PUBLISHED).log_plan)
@@ -150,7 +150,7 @@ def mass(size: Size) -> Study:
 
 
 def gradient(size: Size) -> Study:
-    """The gradient through k iterations against that of the converged plan."""
+    """Compare the gradient through k iterations with that of the converged plan."""
     counts = (1, 3, 10, 50)
     shape = (size.images, size.patches, size.clusters)
     weights = jnp.asarray(np.random.default_rng(1).standard_normal(shape))
@@ -206,8 +206,8 @@ def gradient(size: Size) -> Study:
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     caption = (
         "Gradient with respect to the scores through k iterations, of a random linear function of "
-        "the clusters' part of the plan, against the converged plan's implicit gradient, float64: "
-        f"cosine, and relative size of the difference; medians of {size.images} images."
+        "the clusters' part of the plan, compared with the converged plan's implicit gradient, "
+        f"float64: cosine and relative difference; medians of {size.images} images."
     )
     header = ("scores", "std", *(f"k = {k}" for k in counts))
     return Study(Table(header, rows, caption, 2), values, figure)
@@ -224,7 +224,7 @@ SOLVERS: dict[str, dict[str, Any]] = {
 
 
 def acceleration(size: Size) -> Study:
-    """Iterations until the tolerance is met."""
+    """Count iterations until the tolerance is met."""
     values, rows = [], []
     for kind, scale, scores in cases(size):
         for name, fields in SOLVERS.items():
@@ -267,8 +267,8 @@ def acceleration(size: Size) -> Study:
     axes[0].set_ylabel("iterations: median (bar), most (dash)")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     caption = (
-        f'Iterations to a tolerance, float64: median / most of {size.images} images; "missed": '
-        f"images that did not meet it in {size.limit}. An iteration of Newton costs several."
+        f'Iterations to a tolerance, float64: median / maximum of {size.images} images; "missed": '
+        f"images that did not meet it in {size.limit}. A Newton iteration costs several others."
     )
     header = ("scores", "std", "solver", "to 1e-3", "to 1e-6")
     return Study(Table(header, rows, caption, 3), values, figure)
@@ -276,13 +276,13 @@ def acceleration(size: Size) -> Study:
 
 EPSILONS = (1.0, 0.1, 1e-2, 1e-3, 2e-4)
 FORMATS = {"float32": 1e-3, "float64": 1e-6}
-"""The tolerance of each: what it can hold at the sharpest scores, and what one may ask of it."""
+"""The tolerance of each type: float32 can't reach a lower one at the sharpest scores."""
 FEW = 8
-"""Most images to wait for: at small epsilon plain iterations run to the limit."""
+"""Maximum number of images: at small epsilon, plain iterations run to the limit."""
 
 
 def cosines(size: Size) -> np.ndarray:
-    """Cosines of random unit vectors of 16 numbers."""
+    """Draw cosines of random unit vectors of 16 dimensions."""
     generator = np.random.default_rng(0)
     images = min(size.images, FEW)
     sides = [
@@ -293,7 +293,7 @@ def cosines(size: Size) -> np.ndarray:
 
 
 def sharpness(size: Size) -> Study:
-    """Iterations and time of the steps as epsilon falls."""
+    """Measure iterations and time of the steps as epsilon decreases."""
     values, rows = [], []
     for dtype, tolerance in FORMATS.items():
         scores = jnp.asarray(cosines(size), dtype)
@@ -306,7 +306,7 @@ def sharpness(size: Size) -> Study:
                     tolerance=tolerance,
                     iterations=size.limit,
                     gradient=Stop(),
-                    # Scores over a smaller epsilon are out of the scaling domain's range.
+                    # Scores over a smaller epsilon exceed the range of the scaling domain.
                     domain="scaling" if epsilon >= 0.1 else "log",
                     **fields,
                 )
@@ -352,10 +352,10 @@ def sharpness(size: Size) -> Study:
     axes[0].legend(frameon=False, fontsize=8)
     tolerances = ", ".join(f"{x} to {y:g}" for x, y in FORMATS.items())
     caption = (
-        f"Cosines of random unit vectors of 16 numbers, over epsilon; tolerance: {tolerances}. "
-        f'Iterations, median / most of {min(size.images, FEW)} images; "missed": images that did '
-        f'not meet it in {size.limit}; "x": the time of the batch, the least of '
-        "3 calls, over that of Newton's."
+        f"Cosines of random unit vectors of 16 dimensions, over epsilon; tolerance: {tolerances}. "
+        f'Iterations, median / maximum of {min(size.images, FEW)} images; "missed": images that '
+        f'did not meet it in {size.limit}; "x": the time of the batch, the minimum of '
+        "3 calls, relative to Newton's."
     )
     return Study(Table(("type", "epsilon", *SOLVERS), rows, caption, 2), values, figure)
 
@@ -387,7 +387,7 @@ class RoundedStep(Step):
         return Potentials(self.rounded(problem.log_mu - sums), column), state
 
     def rounded(self, x: jax.Array) -> jax.Array:
-        # A cast there and back is taken out by the compiler; this is not.
+        # The compiler removes a cast there and back, but not this.
         return jax.lax.reduce_precision(x, self.exponent, self.mantissa)
 
     def log_sum(self, x: jax.Array, axis: int) -> jax.Array:
@@ -398,7 +398,7 @@ class RoundedStep(Step):
 
 
 def precision(size: Size) -> Study:
-    """Plans of 3 iterations in lower precision against float64's."""
+    """Compare plans of 3 iterations in lower precision with the float64 plan."""
 
     def plan_of(scores: jax.Array, config: SinkhornConfig = PUBLISHED) -> np.ndarray:
         return np.exp(np.asarray(solve_published(scores, config).log_plan, np.float64))
@@ -438,8 +438,8 @@ def precision(size: Size) -> Study:
     axes[0].set_ylabel("largest error in the plan")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     caption = (
-        "Largest difference of the plan of 3 iterations from that in float64, where no entry is "
-        f'above 1: median of {size.images} images (and the worst). "Inside": every '
+        "Largest difference of the plan of 3 iterations from the float64 plan, whose entries are at "
+        f'most 1: median of {size.images} images (and the worst). "Inside": every '
         "intermediate result of the transport is rounded to that format."
     )
     header = ("scores", "std", *ways)
@@ -456,7 +456,7 @@ DUSTBINS: dict[str, dict[str, Any]] = {
 
 
 def dustbin(size: Size) -> Study:
-    """How much the dustbin's parameter matters, by variant."""
+    """Measure how much the dustbin's parameter matters, by variant."""
     weights = jnp.asarray(
         np.random.default_rng(1).standard_normal((size.images, size.patches, size.clusters))
     )
@@ -465,7 +465,7 @@ def dustbin(size: Size) -> Study:
     def measure(
         dustbin: str = "column", iterations: int = PUBLISHED.iterations, column_tau: float = 1.0
     ) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
-        """Of scores, by image: the size of the gradient, and how far a plan goes."""
+        """Return the gradient's size and the plan's largest change, by image."""
         token, config = dustbin == "token", SinkhornConfig(iterations=iterations)
 
         def plan(scores: jax.Array, z: jax.Array) -> jax.Array:
@@ -502,10 +502,10 @@ def dustbin(size: Size) -> Study:
     axes.set_ylabel("|dL/dz|")
     axes.legend(frameon=False, fontsize=8, ncols=len(SCALES))
     caption = (
-        "What the dustbin's parameter z does, iid scores, float64, medians of "
+        "Effect of the dustbin's parameter z, iid scores, float64, medians of "
         f"{size.images} images: |dL/dz| at z = 0 for L a random linear function of the clusters' "
-        "part of the plan, and the largest change of an entry of the plan when z grows by 1 (a "
-        "token's: by a standard Gaussian; |dL/dz| is then the norm over tokens)."
+        "part of the plan, and the largest change of an entry of the plan when z grows by 1 (for "
+        "a token: by a standard Gaussian; |dL/dz| is then the norm over tokens)."
     )
     header = ("dustbin", *(f"std {scale:g}" for scale in SCALES))
     return Study(Table(header, rows, caption), values, figure)
@@ -523,7 +523,7 @@ STUDIES: dict[str, Callable[[Size], Study]] = {
 
 
 def main() -> None:
-    parser = flags("Study the transport; see the top.", "docs/sinkhorn")
+    parser = flags("Study the transport; see the module docstring.", "docs/sinkhorn")
     parser.add_argument("--images", type=count, default=Size().images)
     arguments = read_some(parser, STUDIES)
     size = Size(images=arguments.images)

@@ -1,13 +1,13 @@
-"""What parts of a model and variations of the rendered world are worth: many short trainings.
+"""Measure the effect of model parts and of variations of the rendered world in short trainings.
 
     python scripts/bench/study_small.py --runs RUNS [--data SET...] [STUDY...]
 
-Studies: transport, transport_more and encoder (a small ViT with SALAD), adapters (such a ViT that
-was trained on a plainer world, frozen), world (a small ResNet with Conv-AP, from which the world
-leaves out one variation at a time) and distil (starter-1 for a quarter of its pixels, trained on
-places' labels, on the descriptors of starter-1, or on both, in as many steps). All train on
-rendered places alone, and are asked on other rendered places and on each SET, by its folder's name.
-Runs that RUNS already holds are gone on with. A run takes two to ten minutes of two cores.
+Studies: transport, transport_more and encoder (a small ViT with SALAD), adapters (such a ViT,
+trained on a plainer world and frozen), world (a small ResNet with Conv-AP, on worlds that leave out
+one variation at a time) and distil (starter-1 with a quarter of its pixels, trained on place
+labels, on the descriptors of starter-1, or on both, in the same number of steps). All train only on
+rendered places, and are evaluated on other rendered places and on each SET, named by its folder.
+Runs in RUNS are resumed. A run takes two to ten minutes on two cores.
 """
 
 import collections
@@ -46,7 +46,7 @@ from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.progress import progress_bar
 
 WORLD = WorldConfig(sceneries=("street", "corridor", "country"), hard=0.0)
-"""The world of the tables in docs/small.md, before it had rooms, shapes and hard stands."""
+"""The world of the tables in docs/small.md, from before rooms, shapes and hard stands."""
 WORLD_BASE = pathlib.Path(__file__).parents[2] / "docs" / "small" / "world_base.json"
 BATCH = {"places_per_batch": 24, "images_per_place": 2, "min_images": 2}
 DUSTBINS = ("dustbin a token", "dustbin's mass learnt")
@@ -78,7 +78,7 @@ ADAPTERS = ("depthwise", "multi-resolution", "mlp", "serial-parallel", "side", "
 
 
 class Asked(NamedTuple):
-    """A set that is asked, with a short name for its images and which of them are right."""
+    """A set to evaluate on, with a short name for its images and their correct answers."""
 
     data: Benchmark
     contents: str
@@ -91,13 +91,13 @@ class Arm(NamedTuple):
     config: TrainConfig
     world: WorldConfig
     start: "Arm | None" = None
-    """Whose run with the same seed gives the backbone to start from."""
+    """The arm whose run with the same seed provides the initial backbone."""
     teacher: str | None = None
-    """The model that it learns from, as `load` takes it."""
+    """The model to distil, in a form that `load` accepts."""
 
 
 def small_vit() -> TrainConfig:
-    """The recipe of `tiny` with half its width, three blocks, 5 x 7 patches, and no encoder."""
+    """Make the recipe of `tiny` with half its width, three blocks, 5 x 7 patches and no encoder."""
     start = recipe("tiny")
     backbone: Any = start.model.backbone
     model = dataclasses.replace(
@@ -110,14 +110,14 @@ def small_vit() -> TrainConfig:
 
 
 def with_encoder(config: TrainConfig) -> TrainConfig:
-    """The same with the encoder of `tiny`."""
+    """Add the encoder of `tiny` to a configuration."""
     encoder: CrossImage = recipe("tiny").model.cross_image
     model = dataclasses.replace(config.model, cross_image=encoder)
     return dataclasses.replace(config, model=model)
 
 
 def small_resnet() -> TrainConfig:
-    """A training of the model in the package with half its width and fewer pixels."""
+    """Make a training of the packaged model with half its width and fewer pixels."""
     start = read_config(TrainConfig, WORLD_BASE)
     backbone: Any = start.model.backbone
     model = dataclasses.replace(
@@ -127,7 +127,7 @@ def small_resnet() -> TrainConfig:
 
 
 def transport() -> list[Arm]:
-    """Each transport in the place of the published one."""
+    """Replace the published transport with each of the others."""
     world = WORLD
     return [
         Arm(label, with_transport(small_vit(), fields), world)
@@ -136,7 +136,7 @@ def transport() -> list[Arm]:
 
 
 def transport_more() -> list[Arm]:
-    """Further transports, each in the place of the published one."""
+    """Replace the published transport with each of the further ones."""
     return [
         Arm(label, with_transport(small_vit(), fields), WORLD)
         for label, fields in MORE_TRANSPORTS.items()
@@ -144,7 +144,7 @@ def transport_more() -> list[Arm]:
 
 
 def adapters() -> list[Arm]:
-    """A frozen backbone that has seen no seasons, times or weather, and adapters that then do."""
+    """Train adapters on seasons, times and weather, over a frozen backbone that saw none."""
     world = WORLD
 
     def config(adapter: str, trainable: str) -> TrainConfig:
@@ -167,13 +167,13 @@ def adapters() -> list[Arm]:
 
 
 def encoder() -> list[Arm]:
-    """Without and with the cross-image encoder."""
+    """Train without and with the cross-image encoder."""
     without, world = small_vit(), WORLD
     return [Arm("without", without, world), Arm("with", with_encoder(without), world)]
 
 
 def world() -> list[Arm]:
-    """The whole world, and worlds that leave out one variation each."""
+    """Train on the whole world, and on worlds that leave out one variation each."""
     whole, config = dataclasses.replace(WORLD, scenes=600, test_scenes=1), small_resnet()
     arms = [Arm("whole", config, whole)]
     for name in VARIATIONS:
@@ -193,7 +193,7 @@ def world() -> list[Arm]:
 
 
 def distillation() -> list[Arm]:
-    """Labels alone, the teacher alone, and both."""
+    """Train on labels only, on the teacher only, and on both."""
     start = read_config(TrainConfig, WORLD_BASE)
     model = dataclasses.replace(start.model, image_size=(96, 128))
     config = dataclasses.replace(start, model=model, epochs=6, **BATCH)
@@ -216,12 +216,12 @@ STUDIES = {
 
 
 def digest(value: Any) -> str:
-    """A short name for JSON values."""
+    """Make a short name for a JSON value."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def named(value: Any) -> str:
-    """A short name for a configuration: runs and worlds of two studies are shared by it."""
+    """Make a short name for a configuration, by which studies share runs and worlds."""
     return digest(to_plain(value))
 
 
@@ -232,7 +232,7 @@ def open_asked(path: pathlib.Path) -> Asked:
 
 
 def folder_of(arm: Arm, seed: int, runs: pathlib.Path) -> pathlib.Path:
-    """Where an arm's training with a seed is kept."""
+    """Return the folder of an arm's training with a seed."""
     names = [named(dataclasses.replace(arm.config, seed=seed)), named(arm.world)]
     if arm.start is not None:
         names.append(folder_of(arm.start, seed, runs).name)
@@ -242,7 +242,7 @@ def folder_of(arm: Arm, seed: int, runs: pathlib.Path) -> pathlib.Path:
 
 
 def trained(arm: Arm, seed: int, runs: pathlib.Path) -> Model:
-    """Train an arm with a seed, or go on with its run."""
+    """Train an arm with a seed, or resume its run."""
     config = dataclasses.replace(arm.config, seed=seed)
     root = runs / "worlds" / named(arm.world)
     write_world(root, arm.world)
@@ -266,7 +266,7 @@ def trained(arm: Arm, seed: int, runs: pathlib.Path) -> Model:
 
 
 def run(arm: Arm, seed: int, asked: Mapping[str, Asked], runs: pathlib.Path) -> dict[str, Any]:
-    """Recalls of one trained model by set and grouping, and its transport's statistics."""
+    """Return recalls of a trained model by set and grouping, and its transport's statistics."""
     folder = folder_of(arm, seed, runs)
     result = folder / "recalls.json"
     found: dict[str, Any] = json.loads(result.read_text()) if result.exists() else {"contents": {}}
@@ -291,7 +291,7 @@ def run(arm: Arm, seed: int, asked: Mapping[str, Asked], runs: pathlib.Path) -> 
 
 
 def paired(values: Sequence[float], base: Sequence[float]) -> str:
-    """The mean difference of runs of the same seeds, with its 95 % interval by Student's t."""
+    """Format the mean difference of runs of the same seeds, with its 95 % Student's t interval."""
     differences = [a - b for a, b in zip(values, base, strict=True)]
     mean = statistics.mean(differences)
     if len(differences) < 2:
@@ -302,7 +302,7 @@ def paired(values: Sequence[float], base: Sequence[float]) -> str:
 
 
 def study_of(name: str, results: Mapping[str, list[dict[str, Any]]], sets: Sequence[str]) -> Study:
-    """A row an arm and grouping: recall, and how much it differs from the first arm's."""
+    """Tabulate arms and groupings: recall, and its difference to the first arm."""
     first = next(iter(results.values()))
     watched = [key for key in WATCHED if key in first[0]]
     rows = []
@@ -322,17 +322,19 @@ def study_of(name: str, results: Mapping[str, list[dict[str, Any]]], sets: Seque
         header += [f"{data}, {recall}", "difference"]
     header += [WATCHED[key] for key in watched]
     caption = (
-        "Mean recall in percent. A difference is to the first row, of runs with the same seeds, "
-        "with its 95 % interval by Student's t over seeds; of twenty such intervals one leaves out "
-        "0 by chance."
+        "Mean recall in percent. A difference is to the first row, for runs with the same seeds, "
+        "with its 95 % interval by Student's t over seeds; about one in twenty such intervals "
+        "excludes 0 by chance."
     )
     return Study(Table(tuple(header), rows, caption, 2), {"study": name, "runs": results})
 
 
 def main() -> None:
-    parser = flags("Train and tabulate; see the top.", "docs/small")
-    parser.add_argument("--runs", type=pathlib.Path, required=True, help="where trainings are kept")
-    parser.add_argument("--data", type=pathlib.Path, nargs="*", default=[], help="also asked")
+    parser = flags("Train and tabulate; see the module docstring.", "docs/small")
+    parser.add_argument("--runs", type=pathlib.Path, required=True, help="folder for the trainings")
+    parser.add_argument(
+        "--data", type=pathlib.Path, nargs="*", default=[], help="further sets to evaluate on"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     arguments = read_some(parser, STUDIES)
     whole = arguments.runs / "worlds" / named(WORLD)
@@ -340,7 +342,7 @@ def main() -> None:
     asked = {"rendered": open_asked(whole / "test")}
     for path in arguments.data:
         if path.name in asked:
-            parser.error(f"--data: found two sets named {path.name}, expected other names")
+            parser.error(f"--data: found two sets named {path.name}, expected different names")
         asked[path.name] = open_asked(path)
     arms = {name: STUDIES[name]() for name in arguments.studies}
     results: dict[str, dict[str, list[dict[str, Any]]]] = collections.defaultdict(dict)

@@ -1,8 +1,8 @@
-"""Recall of the model in the package, of HOG, and of the same network with random weights.
+"""Measure recall of the packaged model, of HOG, and of the same network with random weights.
 
     python scripts/bench/study_starter.py --data SET... [--weights FILE] [--others NAME=FILE...]
 
-Images are described independently. Intervals are the bootstrap's, of 95 %.
+Images are described independently. Intervals are 95 % bootstrap intervals.
 """
 
 import pathlib
@@ -28,7 +28,7 @@ Models = dict[str, tuple[Crisalad, ModelConfig]]
 def by_model(
     params: Crisalad, config: ModelConfig, data: Benchmark
 ) -> tuple[Mapping[int, float], Interval]:
-    """Recalls of a model, and the interval of the first."""
+    """Return the recalls of a model, and the interval of the first."""
     (result,) = evaluate(
         Model(params, config), data, groupings=["single"], reading=Reading(quiet=True)
     )

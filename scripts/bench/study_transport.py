@@ -1,11 +1,11 @@
-"""Recall by Sinkhorn variant: short trainings of `tiny` on the synthetic city, several seeds.
+"""Measure recall by Sinkhorn variant in short trainings of `tiny`, with several seeds.
 
-    python scripts/bench/study_transport.py --runs RUNS [--data DIR]
+    python scripts/bench/study_transport.py --runs RUNS [--data DIR] [--out docs/sinkhorn]
 
-With --data, some of the variants also on photographs: trained on DIR/sped_train (GSV-Cities
-layout), tested on DIR/sped_val (@UTM layout). Runs that RUNS already holds are gone on with. Writes
-recall.md, recall.json and recall.png to --out, and with --page puts the table into that page. A run
-takes one to two minutes on two cores.
+All variants train on the synthetic city. With --data, some also train on photographs in
+DIR/sped_train (GSV-Cities layout), and are tested on DIR/sped_val (@UTM layout). Runs in RUNS are
+resumed. It writes recall.md, recall.json and recall.png into --out. A run takes one to two minutes
+on two cores.
 """
 
 import dataclasses
@@ -59,16 +59,16 @@ WATCHED = {
     "dustbin_share": "dustbin",
     "patches_per_cluster": "patches",
 }
-"""Of the transport in the last step: the largest relative error of a cluster's mass, the dustbin's
-share of all mass, the effective number of patches in a cluster."""
+"""Statistics of the transport in the last step: the largest relative error of a cluster's mass, the
+dustbin's share of all mass, the effective number of patches in a cluster."""
 DIGITS = {"R@1": 1, "R@5": 1, "marginal_error": 3, "dustbin_share": 2, "patches_per_cluster": 1}
 
 Runs = list[dict[str, float]]
-"""What each seed's run came to."""
+"""The results of each seed's run."""
 
 
 def with_transport(config: TrainConfig, fields: dict[str, Any]) -> TrainConfig:
-    """Fields of the problem are SALAD's; the others say how it is solved."""
+    """Change SALAD's fields for the problem, and the solver's for all others."""
     problem = {name: fields[name] for name in fields if hasattr(config.model.aggregator, name)}
     solver = SinkhornConfig(**{name: fields[name] for name in fields if name not in problem})
     salad = dataclasses.replace(config.model.aggregator, sinkhorn=solver, **problem)
@@ -78,7 +78,7 @@ def with_transport(config: TrainConfig, fields: dict[str, Any]) -> TrainConfig:
 def run(
     config: TrainConfig, places: Places, benchmark: Benchmark, folder: pathlib.Path
 ) -> dict[str, float]:
-    """Recalls of the trained model, every image described alone, and its transport's statistics."""
+    """Return recalls of a trained model on single images, and its transport's statistics."""
     params = fit(config, places, folder, validation=benchmark, quiet=True).params
     (result,) = evaluate(
         Model(params, config.model), benchmark, groupings=("single",), reading=Reading(quiet=True)
@@ -88,13 +88,13 @@ def run(
 
 
 def spread(values: list[float], digits: int) -> str:
-    """Mean and sample standard deviation."""
+    """Format mean and sample standard deviation."""
     mean = f"{statistics.mean(values):.{digits}f}"
     return f"{mean} ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else mean
 
 
 def study_of(results: dict[str, dict[str, Runs]]) -> Study:
-    """A row a variant of each benchmark; every run a dot, the mean a bar."""
+    """Tabulate variants by benchmark, and plot each run as a dot and the mean as a bar."""
     rows, seeds = [], 0
     figure, axes = panels(len(results), tuple(results), width=5.5, height=4.2, sharey=False)
     for axis, (benchmark, variants) in zip(axes, results.items(), strict=True):
@@ -110,8 +110,8 @@ def study_of(results: dict[str, dict[str, Runs]]) -> Study:
         axis.grid(axis="x", alpha=0.3)
         axis.set_xlabel("Recall@1, %", fontsize=9)
     caption = (
-        f"`tiny` trained from nothing with each transport, {seeds} seeds, mean and sample standard "
-        "deviation: recall of images described one by one, the largest relative error of a "
+        f"`tiny` trained from scratch with each transport, {seeds} seeds, mean and sample standard "
+        "deviation: recall of images described independently, the largest relative error of a "
         "cluster's mass, the share of all mass in the dustbin, and the effective number of patches "
         "in a cluster."
     )
@@ -120,9 +120,13 @@ def study_of(results: dict[str, dict[str, Runs]]) -> Study:
 
 
 def main() -> None:
-    parser = flags("Train and tabulate; see the top.", "docs/sinkhorn")
-    parser.add_argument("--runs", type=pathlib.Path, required=True, help="where trainings are kept")
-    parser.add_argument("--data", type=pathlib.Path, help="also train and test on its sped_*")
+    parser = flags("Train and tabulate; see the module docstring.", "docs/sinkhorn")
+    parser.add_argument("--runs", type=pathlib.Path, required=True, help="folder for the trainings")
+    parser.add_argument(
+        "--data",
+        type=pathlib.Path,
+        help="folder with sped_train and sped_val, also to train and test on",
+    )
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--epochs", type=count, default=12)

@@ -1,10 +1,10 @@
-"""What verified answers are worth on rendered streets, where the camera's pose is known.
+"""Evaluate verified answers on rendered streets, where the camera's pose is known.
 
     python scripts/bench/study_verification.py [--streets 20] [--pairs DATABASE QUERIES]
 
 Each street is seen from two places of a map, 1.7 m apart, and by a query 2 to 3 m away that is
-turned by up to 15 degrees, in the same light or in another season and time. Prints rows of a
-table: medians, and the processor's time. --pairs counts inliers of all pairs of two folders.
+rotated by up to 15 degrees, in the same light or in another season and time. It prints table rows:
+medians and processor time. --pairs counts the inliers of all pairs of two folders.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from crisalad_jax.synthetic.view import Camera, View
 
 SIZES = ((120, 160), (240, 320), (480, 640), (720, 960))
 FLIP = np.diag([1.0, -1, 1])
-"""From right, up, ahead to OpenCV's right, down, ahead."""
+"""Converts axes from right, up, forward to OpenCV's right, down, forward."""
 LIGHTS = {
     "same light": {},
     "another season": {"season": "autumn", "weather": "overcast", "repaint": 0.1},
@@ -80,7 +80,7 @@ def study(folder: pathlib.Path, size: tuple[int, int], light: dict, streets: int
 
 
 def count_pairs(database: pathlib.Path, queries: pathlib.Path) -> None:
-    """Print the inliers of every query with the two images that have most."""
+    """Print the inliers of every query with its two best images."""
     verifier, files = Verifier(Verify()), list_images(database)
     names = [(str(file.parent), file.name) for file in files]
     for query in list_images(queries):

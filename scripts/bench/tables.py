@@ -1,4 +1,4 @@
-"""The output of a study: a page with its table, its values as JSON, and a picture."""
+"""Output of a study: a page with its table, its values as JSON, and a plot."""
 
 import argparse
 import json
@@ -22,40 +22,40 @@ TITLES = {
     "leakage": "How groupings leak places",
     "order": "Recall by the order of the images",
     "runtimes": "Recall by runtime",
-    "zoo": "Published models exported",
+    "zoo": "Exported published models",
     "bench_million": "A million images",
-    "bench_cluster": "Describing on a cluster",
+    "bench_cluster": "Describing on a Ray cluster",
     "sequence": "Recall of the sequence filter",
-    "bench_describe_costs": "What describing costs",
-    "bench_train_costs": "What a training step costs",
-    "bench_locate": "Answers per second of a robot",
-    "bench_scale": "Speed by the number of devices",
+    "bench_describe_costs": "First call and memory of describing",
+    "bench_train_costs": "First call and memory of a training step",
+    "bench_locate": "Latency of Map.locate",
+    "bench_scale": "Time and memory by input size",
     "bench_published": "Speed of published models",
-    "bench_published_costs": "What published models cost",
+    "bench_published_costs": "First call and memory of published models",
     "bench_extract": "From a folder of images to descriptors",
     "bench_start": "From a new process to the first descriptor",
     "bench_bfloat16": "Error of bfloat16",
     "bench_recall": "Recall in bfloat16",
-    "bench_products": "Precision of matrix products",
+    "bench_products": "Speed of matrix products by type",
     "bench_gradients": "Gradients in bfloat16",
-    "bench_versions": "Speed by version of jax",
-    "study_compiler": "Options of the compiler",
+    "bench_versions": "Speed by JAX version",
+    "study_compiler": "XLA compiler options",
     "bench_profile": "Where the time goes",
     "bench_pooling": "Speed of pooling",
     "bench_describe": "Speed of describing",
     "bench_train": "Speed of training",
     "bench_query": "Time of a query",
-    "bench_search": "Speed of searches",
-    "search_memory": "Memory of searches",
-    "search_approximate": "Approximate searches",
+    "bench_search": "Speed of exact search",
+    "search_memory": "Memory of exact search",
+    "search_approximate": "Approximate search",
     "bench_serve": "Throughput of the service",
-    "dustbin": "What a dustbin receives",
-    "error": "Error of a plan by iterations",
-    "mass": "Mass by iterations",
-    "gradient": "Error of a gradient",
-    "acceleration": "Accelerated steps",
-    "sharpness": "Sharpness of plans",
-    "precision": "Error by precision",
+    "dustbin": "Effect of the dustbin's parameter",
+    "error": "Marginal error by iterations",
+    "mass": "Cluster masses after 3 iterations",
+    "gradient": "Gradient error by iterations",
+    "acceleration": "Iterations of accelerated solvers",
+    "sharpness": "Iterations by epsilon",
+    "precision": "Plan error by precision",
     "recall": "Recall by transport",
     "bench_fixed": "Speed of a fixed number of iterations",
     "bench_converged": "Speed to convergence",
@@ -65,17 +65,17 @@ TITLES = {
     "encoder": "The cross-image encoder in small trainings",
     "world": "Variations of the rendered world",
     "distil": "Distillation in small trainings",
-    "recalls": "Recall of the model in the package",
+    "recalls": "Recall of the packaged model",
     "bench_memory": "Memory of a training step",
     "bench_loader": "Speed of the loader",
     "bench_overlap": "Loading during training",
-    "bench_index": "Reading an index of GSV-Cities",
+    "bench_index": "Indexing a data set of the size of GSV-Cities",
 }
 """The title of each study's page, by the name of its files."""
 
 
 class Table(NamedTuple):
-    """One table: the first `labels` columns are words, the others numbers."""
+    """A table: the first `labels` columns hold text, the others numbers."""
 
     header: tuple[str, ...]
     rows: list[tuple[str, ...]]
@@ -86,12 +86,12 @@ class Table(NamedTuple):
 class Study(NamedTuple):
     table: Table
     values: Any
-    """The same unrounded, for JSON."""
+    """The unrounded values, for JSON."""
     figure: Figure | None = None
 
 
 def number(value: float) -> str:
-    """Two significant digits."""
+    """Format a number with two significant digits."""
     value = float(value)
     return f"{value:.1e}" if value and not 1e-3 <= abs(value) < 1e4 else f"{value:.2g}"
 
@@ -103,12 +103,12 @@ def markdown(table: Table) -> str:
 
 
 def files_of(name: str, out: pathlib.Path) -> list[pathlib.Path]:
-    """Return where a study saves its page, its values, and its picture if it has one."""
+    """Return the paths of a study's page, values and plot."""
     return [out / f"{name}{suffix}" for suffix in (".md", ".json", ".png")]
 
 
 def save(name: str, study: Study, out: pathlib.Path) -> None:
-    """Write NAME.md, NAME.json and, with a figure, NAME.png."""
+    """Write NAME.md, NAME.json and, if there is a figure, NAME.png."""
     page, values, picture = files_of(name, out)
     tables.write_text(page, f"# {TITLES[name]}\n\n{markdown(study.table)}")
     with atomic_path(values) as temporary:
@@ -126,26 +126,28 @@ def flags(description: str, out: str) -> argparse.ArgumentParser:
 
 
 def count(text: str) -> int:
-    """An argument that is a whole number from 1."""
+    """Parse an argument that is an integer >= 1."""
     if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number from 1")
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number >= 1")
     return int(text)
 
 
 def read(parser: argparse.ArgumentParser, *names: str) -> argparse.Namespace:
-    """Parse arguments, and check that studies of these names can be saved."""
+    """Parse arguments, and check that the studies `names` can be saved."""
     arguments = parser.parse_args()
     _check_targets(parser, arguments, names)
     return arguments
 
 
 def read_some(parser: argparse.ArgumentParser, names: Collection[str]) -> argparse.Namespace:
-    """Parse arguments with `studies`, those of `names` to run (by default all), as `read` does."""
+    """Parse arguments like `read`, with `studies`: those of `names` to run, by default all."""
     words = ", ".join(names)
-    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {words}")
+    parser.add_argument(
+        "studies", nargs="*", metavar="STUDY", help=f"one of {words}; all by default"
+    )
     arguments = parser.parse_args()
     if unknown := set(arguments.studies) - set(names):
-        parser.error(f"found {', '.join(sorted(unknown))}, expected of {words}")
+        parser.error(f"found {', '.join(sorted(unknown))}, expected some of {words}")
     arguments.studies = arguments.studies or list(names)
     _check_targets(parser, arguments, arguments.studies)
     return arguments
@@ -172,7 +174,7 @@ def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:
 def panels(
     count: int, titles: tuple[str, ...], *, width: float = 4.0, height: float = 3.4, sharey=True
 ) -> tuple[Figure, list[Axes]]:
-    """A row of panels in the project's plain style."""
+    """Make a row of panels in the project's plain style."""
     figure = Figure(figsize=(width * count, height), layout="constrained")
     axes = list(figure.subplots(1, count, squeeze=False, sharey=sharey)[0])
     for one, title in zip(axes, titles, strict=True):
@@ -186,7 +188,7 @@ def bars(
     length: str,
     label: str,
 ) -> Figure:
-    """A panel for each title, in it a bar for each contender, as long as the first of `length`."""
+    """Plot one panel per title, with a bar per contender as long as the first value of `length`."""
     titles = tuple(dict.fromkeys(map(title, values)))
     names = list(dict.fromkeys(value["contender"] for value in values))
     figure, axes = panels(len(titles), titles, width=3.4, height=2.8, sharey=False)

@@ -1,10 +1,11 @@
-"""Programs timed side by side in one run, and a measure of what the machine can do.
+"""Time programs side by side in one run.
 
-Fairness. The contenders take turns, `rounds` times: a pause of a quarter of a second, in which the
-threads of the one before stop spinning (OpenMP's do so after each call), as long again of calls
-that do not count, so that cores and caches are as warm for the quick as for the slow, then as long
-again, and `calls` at least, of calls that do. A ratio is that of two medians of the same round; of
-the ratios the median over rounds is shown, and the range. All use as many threads as they like.
+Fairness: the contenders take turns, `rounds` times. A turn is a pause of a quarter of a second, in
+which the previous contender's threads stop spinning (OpenMP threads spin after each call); a quarter
+of a second of calls that do not count, so that cores and caches are equally warm for fast and slow
+contenders; then a quarter of a second, and at least `calls`, of calls that count. A ratio is between
+two medians of the same round; tables show the median of the ratios over rounds, and the range. All
+contenders may use any number of threads.
 """
 
 import importlib.metadata
@@ -20,21 +21,21 @@ from typing import Any, NamedTuple, TypeVar
 
 from crisalad_jax.utils.host import usable_cores
 
-# On a GPU jax would take most of the memory at once, and leave torch too little.
+# On a GPU, jax would preallocate most of the memory, and leave torch too little.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-# As the command line does, where all cores may be used.
+# Like the command line, which may use all cores.
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(usable_cores()))
 
 import jax
 import torch
 
 _Name = TypeVar("_Name", bound=Hashable)
-# First calls are from nothing, whatever ran before.
+# First calls start with an empty cache, whatever ran before.
 _KERNELS = tempfile.TemporaryDirectory(prefix="inductor-")
 os.environ["TORCHINDUCTOR_CACHE_DIR"] = _KERNELS.name
 
 if torch.cuda.is_available():
-    # There jax would by itself round what it multiplies to 10 bits (TF32), and torch would not.
+    # On a GPU, jax by default rounds the factors of products to 10 bits (TF32), and torch does not.
     jax.config.update("jax_default_matmul_precision", "highest")
 
 PAUSE = 0.25
@@ -52,7 +53,7 @@ class Timed(NamedTuple):
 def race(
     contenders: Mapping[_Name, Callable[[], Any]], rounds: int, calls: int
 ) -> dict[_Name, Timed]:
-    """The contenders' times by their names; each does the whole of the work and waits for it."""
+    """Time contenders by name; each call does all of its work and waits for the result."""
     timed = {name: Timed([]) for name in contenders}
     for _ in range(rounds):
         for name, call in contenders.items():
@@ -70,7 +71,7 @@ def race(
 
 
 def run_program(command: list[str], caches: Mapping[str, str]) -> tuple[float, str]:
-    """Run a program as a user would, but with caches of its own; its seconds and what it prints."""
+    """Run a program with separate caches; return its seconds and its output."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
     started = time.perf_counter()
     done = subprocess.run(
@@ -80,7 +81,7 @@ def run_program(command: list[str], caches: Mapping[str, str]) -> tuple[float, s
 
 
 def ratio(slow: Timed, fast: Timed) -> tuple[float, float, float]:
-    """How many times faster: median over the rounds, least, most."""
+    """Return the speedup of `fast` over `slow`: median over rounds, minimum, maximum."""
     found = [a / b for a, b in zip(slow.rounds, fast.rounds, strict=True)]
     return statistics.median(found), min(found), max(found)
 
@@ -94,10 +95,10 @@ def megabytes(size: float) -> str:
 
 
 def torch_memory(call: Callable[[], Any]) -> int:
-    """Bytes that a call of torch's needs at once, what it returns included.
+    """Measure the peak bytes of a torch call, including what it returns.
 
-    The peak of the allocations less the releases that the profiler sees; on a GPU, of the
-    allocator's counter.
+    This is the peak of allocations minus releases in the profiler; on a GPU, of the allocator's
+    counter.
     """
     if torch.cuda.is_available():
         before = torch.cuda.memory_allocated()
@@ -115,18 +116,18 @@ def torch_memory(call: Callable[[], Any]) -> int:
 
 
 def wait() -> None:
-    """For what torch has begun on a GPU."""
+    """Wait for pending work of torch on a GPU."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
 
 
 def measured(rounds: int, *packages: str) -> str:
-    """On what, and how: for the caption of a table of `ratio`s."""
-    return f"{machine(*packages)}; medians and ranges of {rounds} rounds"
+    """Describe the machine and the rounds, for the caption of a table of `ratio`s."""
+    return f"{machine(*packages)}; medians and ranges of {rounds} round{'s' * (rounds != 1)}"
 
 
 def machine(*packages: str) -> str:
-    """What the figures were measured on, with the versions of jax, torch and more packages."""
+    """Describe the machine, with the versions of jax, torch and further packages."""
     device = jax.devices()[0]
     name = device.device_kind
     if device.platform == "cpu":

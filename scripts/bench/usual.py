@@ -1,8 +1,8 @@
-"""The reference of the parity checks as a user of torch would write it.
+"""The reference of the parity checks, as a torch user would write it.
 
-The reference is written to be read: attention step by step, a bias added after its product, every
-step rounded by itself. Here attention is torch's own (`scaled_dot_product_attention`), and biases
-are added within the products.
+The reference is written for readability: attention step by step, a bias added after its product,
+every step rounded separately. Here attention is torch's own (`scaled_dot_product_attention`), and
+biases are added within the products.
 """
 
 import dataclasses
@@ -55,16 +55,16 @@ _USUAL: dict[type, type] = {
 
 
 def as_users_write_it(model: Crisalad) -> Crisalad:
-    """Turn a reference model into that, in place."""
+    """Convert a reference model to the usual torch layers, in place."""
     for layer in model.modules():
         layer.__class__ = _USUAL.get(type(layer), type(layer))
     return model
 
 
 def narrowed(model: Crisalad) -> Crisalad:
-    """Keep such a model's weights of products in the type that it computes in, in place.
+    """Store a converted model's product weights in its compute type, in place.
 
-    Otherwise each call converts them. Norms stay float32, as all parameters do that train.
+    Otherwise each call converts them. Norms stay float32, like all parameters that train.
     """
     for layer in model.modules():
         if isinstance(layer, _Linear | _Conv2d | _MultiheadAttention):
@@ -74,7 +74,7 @@ def narrowed(model: Crisalad) -> Crisalad:
 
 
 def widened(model: Crisalad) -> Crisalad:
-    """Return a copy of such a model that computes in float32."""
+    """Return a copy of a converted model that computes in float32."""
     config = dataclasses.replace(model.config, compute_dtype="float32")
     wide = as_users_write_it(Crisalad(config))
     wide.load_state_dict(model.state_dict())

@@ -1,4 +1,4 @@
-"""Compile this package's programs for accelerators that are not here, and count what they do."""
+"""Compile this package's programs for absent accelerators, and count their operations."""
 
 from scripts.compile_check.check import (
     CompileCheck,

@@ -1,8 +1,9 @@
-"""Compile describing and training for GPUs and TPUs that need not be here; run nothing.
+"""Compile describing and training for absent GPUs and TPUs, without running anything.
 
     python -m scripts.compile_check --targets h100 --preset b14 [--expect FIGURES.json]
 
-`pip install -r scripts/bench/compile_check.txt` brings XLA's compilers. They take minutes on a CPU.
+`pip install -r scripts/bench/compile_check.txt` installs XLA's compilers. They take minutes on a
+CPU.
 """
 
 import dataclasses
@@ -22,37 +23,37 @@ from scripts.compile_check.targets import compile_on_cpu
 
 @dataclasses.dataclass(frozen=True)
 class CompileCheck:
-    """Compile describing and training for GPUs and TPUs that need not be here; run nothing."""
+    """Compile describing and training for absent GPUs and TPUs, without running anything."""
 
     settings: Any
     targets: tuple[str, ...] = ("v5e-1", "v5e-8", "v6e-8", "h100", "h100-8")
-    """Machines: v4, v5p, v5e-1, v5e-8, v5e-64, v5e-256, v6e-1, v6e-8, h100, h100-8 (the number of
-    devices; of v4 and v5p a host with four)."""
+    """Machines: v4, v5p, v5e-1, v5e-8, v5e-64, v5e-256, v6e-1, v6e-8, h100, h100-8. The suffix is the
+    number of devices; v4 and v5p are a host with four."""
     programs: tuple[str, ...] = ("describe", "train")
     """describe, train or both."""
     preset: str = "b14"
-    """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
+    """tiny, s14, b14, l14 or g14: the model size that the other flags modify."""
     recipe: str | None = None
-    """How it trains, as in `crisalad train`."""
+    """Training recipe, as in `crisalad train`."""
     config: pathlib.Path | None = None
-    """Configuration of a run (its config.json) to start from instead of a preset."""
+    """Configuration of a run (its config.json) to use instead of a preset."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; replaces --model.image-size."""
     batch_size: int | None = None
-    """Images in a batch on all devices together; by default those of a training step."""
+    """Number of images in a batch, over all devices; by default that of a training step."""
     expect: pathlib.Path | None = None
-    """JSON of an earlier check to compare with: memory and operations within 5 %, and equal numbers
-    of collectives, sums in bfloat16, calls of fused attention and calls of the host."""
+    """JSON of an earlier check to compare with: memory and operations within 5 %, and equal counts of
+    collectives, sums in bfloat16, calls of fused attention and host callbacks."""
     keep: pathlib.Path | None = None
-    """Existing folder for the texts of the compiled programs (HLO)."""
+    """Existing folder for the HLO text of the compiled programs."""
     json: Annotated[pathlib.Path | None, Target((".json",))] = None
-    """File for the figures as JSON, which --expect reads; - prints it."""
+    """File for the figures as JSON, to be read by --expect; - prints it."""
     quiet: bool = False
-    """No progress bar."""
+    """Hide the progress bar."""
 
 
 def main() -> None:
-    """Print the table of what was compiled, write it as JSON, and compare it where asked."""
+    """Print the table of compiled programs, write it as JSON, and compare it with --expect."""
     given = sys.argv[1:]
     start = defaults(given), preset_of(given)
     arguments = parse_settings(CompileCheck, "compile_check", given, *start)

@@ -1,4 +1,4 @@
-"""Answer for an absent GPU what JAX's fused attention asks of it while it is traced."""
+"""Answer the questions that JAX's fused attention asks about the GPU while it is traced."""
 
 import contextlib
 from collections.abc import Iterator
@@ -9,15 +9,15 @@ from jax._src.cudnn import fused_attention_stablehlo as fused
 from crisalad_jax.utils.target import machine
 
 _CUDNN = 91000
-"""The cuDNN that an absent GPU is assumed to have: 9.10."""
+"""The cuDNN version assumed for an absent GPU: 9.10."""
 
 
 @contextlib.contextmanager
 def assuming_cudnn() -> Iterator[None]:
-    """Assume an H100 while the block runs, unless a GPU is here.
+    """Assume an H100 while the block runs, unless a GPU is present.
 
-    These questions have no public answer: JAX reads the version of the loaded cuDNN, and the
-    devices' compute capability.
+    There is no public API for this: JAX reads the version of the loaded cuDNN and the compute
+    capability of the devices.
     """
 
     def has(capability: str) -> bool:

@@ -1,4 +1,4 @@
-"""Compile programs for machines, count what they do, and compare that with what is expected."""
+"""Compile programs for machines, count their operations, and compare with expected figures."""
 
 import dataclasses
 import importlib.metadata
@@ -23,68 +23,68 @@ from scripts.compile_check.programs import PROGRAMS, compile_program
 from scripts.compile_check.targets import MACHINES, Card, check_compiler
 
 TOLERANCE = 0.05
-"""Largest relative difference from what is expected of memory and operations: another version of
-the compiler schedules otherwise."""
+"""Largest relative difference of memory and operations from the expected figures, because another
+version of the compiler schedules differently."""
 _PACKAGES = ("jax", "jaxlib", "libtpu", "jax-cuda12-plugin", "jax-cuda13-plugin")
 
 
 @dataclasses.dataclass(frozen=True)
 class ProgramCheck:
-    """What one compiled program needs and does on each device."""
+    """Resources and operations of one compiled program on each device."""
 
     target: str
     program: str
     images: int
-    """Number of images in the batch, on all devices together."""
+    """Number of images in the batch, over all devices."""
     memory: int
-    """Bytes that the program has at once: what it is given, what it returns, and in between."""
+    """Peak bytes of the program: inputs, outputs and temporary buffers."""
     card_memory: float
-    """Bytes of the card."""
+    """Memory of the card in bytes."""
     aliased: int
-    """Bytes of what it returns that take the place of what it is given."""
+    """Bytes of outputs that reuse the memory of inputs."""
     flops: int
     """Floating-point operations of products."""
     hbm_bytes: int
-    """Bytes of HBM that are read and written, at the boundaries of fusions."""
+    """Bytes of HBM read and written at the boundaries of fusions."""
     sent: int
-    """Bytes that go to other devices."""
+    """Bytes sent to other devices."""
     collectives: Mapping[str, int]
     """Number of collectives in the program's text, by kind."""
     bfloat16_sums: int
-    """Number of sums over devices in bfloat16, which round a gradient."""
+    """Number of sums over devices in bfloat16, which round gradients."""
     fused_attention: int
     """Number of calls of cuDNN's attention, or of Pallas kernels."""
     host_callbacks: int
     """Number of operations that wait for the host."""
     roofline: float
-    """Seconds by roofline: of each operation the longer of its products and its traffic."""
+    """Seconds by roofline: for each operation the larger of its compute and its memory time."""
     messages: float
-    """Seconds of what is sent, at the speed of the links, beside no other work."""
+    """Seconds of communication at the speed of the links, not overlapped with other work."""
     compiler: float | None
     """Seconds by libtpu's estimated cycles, and by its schedule of Pallas kernels; None for a GPU,
-    whose compiler estimates nothing."""
+    whose compiler has no estimates."""
     kernels: float | None
-    """Seconds of Pallas kernels among those; by roofline where libtpu wrote no schedule."""
+    """Seconds of Pallas kernels among those; by roofline if libtpu wrote no schedule."""
 
     @property
     def images_per_second(self) -> float:
-        """Images a second of all devices together, by the longer estimate and the messages."""
+        """Return images per second over all devices, by the larger estimate plus communication."""
         return self.images / (max(self.roofline, self.compiler or 0) + self.messages)
 
 
 @dataclasses.dataclass(frozen=True)
 class CompileCheck:
-    """What was compiled, and for which configuration."""
+    """The compiled programs and their configuration."""
 
     config: TrainConfig
     programs: tuple[ProgramCheck, ...]
     failures: tuple[str, ...] = ()
-    """A line for each program that does not compile."""
+    """One line for each program that doesn't compile."""
     versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Versions of the installed compilers."""
 
     def as_json(self) -> dict[str, Any]:
-        """Put everything into JSON values, which `read_check` reads."""
+        """Convert to JSON values that `read_check` reads."""
         return {
             "versions": dict(self.versions),
             "config": to_plain(self.config),
@@ -103,26 +103,26 @@ def compile_check(
     expected: CompileCheck | None = None,
     quiet: bool = False,
 ) -> CompileCheck:
-    """Compile describing and training for machines that need not be here.
+    """Compile describing and training for machines that may be absent.
 
-    Nothing is executed. XLA's compilers for TPUs and GPUs run on a CPU, with the
-    packages `jax[tpu]` and `jax-cuda12-plugin`. They take minutes and some 3 GB of memory.
+    Nothing is executed. XLA's compilers for TPUs and GPUs run on a CPU, with the packages
+    `jax[tpu]` and `jax-cuda12-plugin`. They take minutes and about 3 GB of memory.
 
     Args:
-        config: the model, and how it trains.
+        config: the model and its training.
         targets: names of `MACHINES`.
         programs: "describe", "train" or both.
-        images: number of images in a batch, on all devices together; None is the configuration's.
-        keep: existing folder for the compiled programs' texts; None keeps none.
-        expected: what `differences` will compare with, whose configuration is checked first.
-        quiet: no progress bar.
+        images: number of images in a batch, over all devices; None uses the configuration's.
+        keep: existing folder for the text of the compiled programs; None writes none.
+        expected: an earlier check to compare with later; its configuration is checked first.
+        quiet: hide the progress bar.
 
     Returns:
-        What each program needs and does. A program that does not compile is a failure there.
+        Resources and operations of each program. Programs that don't compile are in `failures`.
 
     Raises:
-        InputError: no such target, program or folder, a compiler that is not installed, a batch
-            that the devices cannot share, or figures expected of another configuration.
+        InputError: an unknown target, program or folder, a compiler that isn't installed, a batch
+            that the devices can't share equally, or expected figures of another configuration.
 
     Example:
         >>> from crisalad_jax import recipe
@@ -221,10 +221,10 @@ def _cycles(counts: Counts) -> int:
 
 
 def read_check(path: pathlib.Path) -> CompileCheck:
-    """Read what `CompileCheck.as_json` was written as.
+    """Read a check that was written as JSON from `CompileCheck.as_json`.
 
     Raises:
-        InputError: the file cannot be read, or holds something else.
+        InputError: the file can't be read, or isn't a check.
     """
     what = "the JSON of `scripts.compile_check --json`"
     value = read_json(path, what, sealed=False)
@@ -237,20 +237,20 @@ def read_check(path: pathlib.Path) -> CompileCheck:
 
 
 def differences(found: CompileCheck, expected: CompileCheck) -> list[str]:
-    """Compare what was compiled with what is expected.
+    """List the differences between two checks.
 
-    Memory and floating-point operations may differ by `TOLERANCE`; what is counted may not. Times
-    and traffic are not compared.
+    Memory and floating-point operations may differ by `TOLERANCE`; counts may not differ. Times and
+    traffic are not compared.
 
     Args:
-        found: what was compiled.
-        expected: from `read_check`. Programs that were not compiled now are not compared.
+        found: the new check.
+        expected: from `read_check`. Programs that are not in `found` are ignored.
 
     Returns:
-        A line for each difference.
+        One line for each difference.
 
     Raises:
-        InputError: they are of different configurations.
+        InputError: the configurations differ.
     """
     _check_same(found.config, expected.config)
     by_name = {_name(each): each for each in expected.programs}

@@ -1,7 +1,7 @@
-"""Count what a compiled program does on one device: products, memory traffic, messages.
+"""Count the work of a compiled program on one device: products, memory traffic, messages.
 
-A loop's body counts as often as it runs. Of the branches of a condition the one with the least
-traffic counts: in this package the other one is a fallback for scores out of range.
+A loop's body counts once per iteration. For a conditional, only the branch with the least traffic
+counts: in this package the other one is a fallback for scores out of range.
 """
 
 import collections
@@ -25,28 +25,28 @@ _FREE = {
     *("partition-id", "replica-id", "opt-barrier", "add-dependency", "conditional", "call"),
 }
 _NO_WORK = ("AllocateBuffer", "ConcatBitcast")
-"""Custom calls of a TPU that only name memory."""
+"""TPU custom calls that only name memory."""
 KERNEL = "tpu_custom_call"
 """Target of a Pallas kernel for a TPU."""
 _CUDNN = "__cudnn$fmha"
-"""Beginning of the targets of cuDNN's fused attention."""
+"""Prefix of the targets of cuDNN's fused attention."""
 
 
 class Work(NamedTuple):
-    """What one operation does, and how often it runs."""
+    """The work of one operation, and how often it runs."""
 
     name: str
     kind: str
     times: int
     flops: Mapping[str, int]
-    """Floating-point operations of products, once, by the type of their operands. ":highest" and
-    ":high" are added where that precision is asked for."""
+    """Floating-point operations of products per run, by operand type, with ":highest" or ":high"
+    appended if that precision is requested."""
     bytes: int
-    """Bytes of HBM that it reads and writes, once."""
+    """Bytes of HBM read and written per run."""
     sent: int
-    """Bytes that a device sends to others, once, if messages go around a ring."""
+    """Bytes that a device sends to others per run, if messages go around a ring."""
     cycles: int | None
-    """The compiler's estimate of its clock cycles, once; None without one."""
+    """The compiler's estimate of clock cycles per run; None without an estimate."""
     target: str
     """See `Operation.target`."""
     source: str
@@ -54,21 +54,21 @@ class Work(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What a compiled program does on one device."""
+    """The work of a compiled program on one device."""
 
     work: list[Work]
     collectives: dict[str, int]
     """Number of collectives in the program's text, by kind."""
     bfloat16_sums: int
-    """Number of collectives in the text that sum bfloat16 numbers. Two of a TPU's round no sum: of
-    float32 numbers, whose result is rounded as it arrives; and a gather that is written as a sum,
-    in which each number comes from one device and the others add zeros."""
+    """Number of collectives in the text that sum bfloat16 numbers. Two kinds on a TPU don't count,
+    because they round no sum: one of float32 numbers whose result is rounded on arrival; and a
+    gather written as a sum, in which each number comes from one device and the others add zeros."""
     fused_attention: int
     """Number of calls in the text of cuDNN's attention, and of Pallas kernels on a TPU."""
     host_callbacks: int
     """Number of operations in the text that wait for the host."""
     unknown_loops: list[str]
-    """Loops whose number of turns is unknown at compile time; they count once."""
+    """Loops whose number of iterations is unknown at compile time; they count once."""
 
     @property
     def flops(self) -> int:
@@ -77,7 +77,7 @@ class Counts(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """Bytes of HBM that are read and written, at the boundaries of fusions."""
+        """Bytes of HBM read and written at the boundaries of fusions."""
         return sum(each.times * each.bytes for each in self.work)
 
     @property
@@ -89,12 +89,12 @@ class Counts(NamedTuple):
 def count(
     module: Module, devices: int = 1, kernel_cycles: Mapping[str, int] = MappingProxyType({})
 ) -> Counts:
-    """Count what a program does on one device.
+    """Count the work of a program on one device.
 
     Args:
         module: the program.
-        devices: their number, for collectives that do not name their group.
-        kernel_cycles: cycles of the kernels, by name; see `kernels.kernel_cycles`.
+        devices: number of devices, for collectives that don't name their group.
+        kernel_cycles: cycles of the kernels by name; see `kernels.kernel_cycles`.
 
     Returns:
         The counts.
@@ -136,7 +136,7 @@ def _bfloat16_sums(computation: Computation, module: Module) -> int:
 
 
 def _is_one_devices(operation: Operation, module: Module) -> bool:
-    """Return whether a result is a device's own part in a place of zeros for all."""
+    """Return whether a result is one device's part in an array of zeros for all devices."""
     if operation.kind == "fusion":
         (body,) = [name for key, name in operation.called if key == "calls"]
         operation = module.computations[body].root
@@ -155,7 +155,7 @@ class _Counter:
         self.unknown_loops: list[str] = []
 
     def walk(self, name: str, times: int) -> Iterator[Work]:
-        """Yield the work of a computation that runs so many times."""
+        """Yield the work of a computation that runs `times` times."""
         computation = self._computations[name]
         for operation in computation.operations.values():
             called = dict(operation.called)
@@ -179,7 +179,7 @@ class _Counter:
         operations = self._computations[condition].operations
         root = self._computations[condition].root
         limits = [operations[x].inside for x in root.operands if operations[x].kind == "constant"]
-        # JAX counts from 0 to below a constant.
+        # JAX counts from 0 up to a constant, exclusive.
         if root.kind == "compare" and "direction=LT" in root.attributes and len(limits) == 1:
             return int(limits[0])
         self.unknown_loops.append(loop.name)
@@ -245,7 +245,7 @@ class _Counter:
     def _read(self, name: str, number: int) -> int:
         """Count the bytes of HBM that a fused computation reads of a parameter.
 
-        Where only slices of it are used, only these are read.
+        If only slices of it are used, only these are read.
         """
         computation = self._computations[name]
         parameter = computation.parameters[number]
@@ -304,7 +304,7 @@ class _Counter:
 
 
 def _behind(operation: Operation, computation: Computation, kinds: tuple[str, ...]) -> Operation:
-    """Follow the first operands back through operations that keep what they read."""
+    """Follow the first operands back through operations that preserve their input."""
     while operation.kind in kinds and operation.operands[0] in computation.operations:
         operation = computation.operations[operation.operands[0]]
     return operation
@@ -323,7 +323,7 @@ def _is_free(operation: Operation) -> bool:
 
 
 def _written(operation: Operation) -> tuple[Array, ...]:
-    """Return the arrays of a result, without the work space of a library's call."""
+    """Return the arrays of a result, without the workspace of a library call."""
     arrays = operation.arrays
     if operation.kind == "custom-call" and len(arrays) > 1 and arrays[-1].dtype in ("s8", "u8"):
         return arrays[:-1]
@@ -331,9 +331,9 @@ def _written(operation: Operation) -> tuple[Array, ...]:
 
 
 def _moved(operation: Operation) -> int:
-    """Count the bytes of a copy or slice between memories, which runs beside other work."""
+    """Count the bytes of an asynchronous copy or slice between memories."""
     first, second, *_ = operation.arrays
-    # A copy tells its destination first, a slice its source.
+    # A copy lists its destination first, a slice its source.
     source, destination = (second, first) if operation.kind == "copy-start" else (first, second)
     size = destination.bytes
     return (0 if source.on_chip else size) + (0 if destination.on_chip else size)
@@ -367,15 +367,15 @@ def _sent(operation: Operation, computation: Computation, group: int) -> int:
 
 
 def flops_of(operation: Operation, computation: Computation) -> int:
-    """Count the floating-point operations of a product: two for a multiplication and a sum.
+    """Count the floating-point operations of a product: two per multiply-add.
 
     Args:
-        operation: a dot, a convolution, or a call of a library's product or attention; anything
-            else counts 0.
-        computation: where it stands.
+        operation: a dot, a convolution, or a library call for a product or attention; anything else
+            counts 0.
+        computation: the computation that contains it.
 
     Returns:
-        Their number. Taps of a convolution that fall on padding do not count.
+        The number of operations. Taps of a convolution that fall on padding don't count.
     """
     target = operation.target
 
@@ -393,7 +393,7 @@ def flops_of(operation: Operation, computation: Computation) -> int:
         length = math.prod(operand(0).dims[axis] for axis in contracted)
         return 2 * math.prod(operation.arrays[0].dims) * length
     if target.startswith(_CUDNN):
-        # Arrays are (batch, token, head, number). Backward makes the scores again.
+        # Arrays are (batch, token, head, dim). The backward pass recomputes the scores.
         batch, queries, heads, numbers = operand(0).dims
         products = 5 if target.endswith("Backward") else 2
         return 2 * products * batch * heads * queries * operand(1).dims[1] * numbers
@@ -461,7 +461,7 @@ def _convolution(operation: Operation, image: Array, kernel: Array, result: Arra
 def _taps(
     inputs: int, outputs: int, size: int, stride: int, pad: int, dilated: int, spread: int
 ) -> int:
-    """Count the pairs of an output and a tap of the window that meet an input, along one axis."""
+    """Count the pairs of an output and a window tap that fall on an input, along one axis."""
     starts = np.arange(outputs, dtype=np.int64) * stride - pad
     total = 0
     for tap in range(size):

@@ -1,6 +1,6 @@
 """Read the text of a compiled program (HLO, as `jax.stages.Compiled.as_text` returns it).
 
-The grammar is that of XLA's own printer. Only what `counts` asks for is read.
+The grammar is that of XLA's own printer. Only what `counts` needs is parsed.
 """
 
 import functools
@@ -16,7 +16,7 @@ _BITS = {
     **{"s16": 16, "u16": 16, "bf16": 16, "f16": 16, "s32": 32, "u32": 32, "f32": 32},
     **{"s64": 64, "u64": 64, "f64": 64, "c64": 64, "c128": 128},
 }
-"""Bits of a number; other types, such as tokens, take no memory."""
+"""Bits per number; other types, such as tokens, use no memory."""
 _ARRAY = re.compile(r"(\w+)\[([\d,]*)\](?:\{([^{}]*)\})?")
 _HEADER = re.compile(r"(ENTRY )?%?([\w.\-]+) \(.*\) -> .*\{$")
 _LINE = re.compile(r"\s+(ROOT )?%?([\w.\-]+) = (.*)$")
@@ -33,13 +33,13 @@ class Array(NamedTuple):
     dtype: str
     dims: tuple[int, ...]
     layout: str = ""
-    """Order of the dimensions, tiles and memory space, between the braces of the text."""
+    """Order of the dimensions, tiles and memory space: the text between the braces."""
 
     @property
     def on_chip(self) -> bool:
-        """Whether it lies in a TPU's own memory (VMEM or SMEM), and not in HBM.
+        """Whether it is in a TPU's on-chip memory (VMEM or SMEM), not in HBM.
 
-        Spaces of other platforms are not on the chip; their layouts have no tiles.
+        Memory spaces of other platforms are not on-chip; their layouts have no tiles.
         """
         return "S(" in self.layout and "T(" in self.layout
 
@@ -57,7 +57,7 @@ class Array(NamedTuple):
 
     @property
     def hbm_bytes(self) -> int:
-        """Bytes that are not on the chip."""
+        """Bytes that are not on-chip."""
         return 0 if self.on_chip else self.bytes
 
 
@@ -68,13 +68,13 @@ class Operation(NamedTuple):
     kind: str
     """The operation's name in HLO, such as "fusion"."""
     arrays: tuple[Array, ...]
-    """Its result; several arrays of a tuple."""
+    """Its result; several arrays for a tuple."""
     operands: tuple[str, ...]
-    """Names of the operations of the same computation whose results it reads."""
+    """Names of the operations in the same computation whose results it reads."""
     inside: str
-    """The text in the parentheses: of a constant its value, of a parameter its number."""
+    """The text in parentheses: a constant's value, or a parameter's number."""
     attributes: str
-    """The text after them."""
+    """The text after the parentheses."""
     is_root: bool
 
     @property
@@ -84,13 +84,13 @@ class Operation(NamedTuple):
 
     @property
     def source(self) -> str:
-        """The JAX operation that it comes from, with the functions around it."""
+        """The JAX operation that it comes from, with its enclosing functions."""
         found = re.search(r'op_name="([^"]*)"', self.attributes)
         return "" if found is None else found[1]
 
     @property
     def target(self) -> str:
-        """What a custom call calls; else nothing."""
+        """The target of a custom call; otherwise empty."""
         found = re.search(r'custom_call_target="([^"]*)"', self.attributes)
         return "" if found is None else found[1]
 
@@ -102,7 +102,7 @@ class Computation(NamedTuple):
 
     @property
     def root(self) -> Operation:
-        """The operation whose result is the computation's."""
+        """The operation that returns the computation's result."""
         return next(each for each in self.operations.values() if each.is_root)
 
     @property
@@ -117,7 +117,7 @@ class Computation(NamedTuple):
         return [each for each in self.operations.values() if name in each.operands]
 
     def results(self) -> list[Operation]:
-        """Return the operations of the result: of a tuple each element's."""
+        """Return the operations of the result: one per element for a tuple."""
         root = self.root
         return [self.operations[x] for x in root.operands] if root.kind == "tuple" else [root]
 
@@ -130,7 +130,7 @@ class Module(NamedTuple):
     """Name of the computation that runs first."""
 
     def operations(self) -> list[Operation]:
-        """Return all operations, each once, whatever runs it and how often."""
+        """Return all operations, each once, no matter how often it runs."""
         return [each for c in self.computations.values() for each in c.operations.values()]
 
 
@@ -144,7 +144,7 @@ def parse_hlo(text: str) -> Module:
         Its computations.
 
     Raises:
-        InputError: there is no entry computation in the text.
+        InputError: the text has no entry computation.
     """
     computations: dict[str, dict[str, Operation]] = {}
     current: dict[str, Operation] | None = None
@@ -204,7 +204,7 @@ def _split_type(text: str) -> tuple[str, str]:
 
 @functools.lru_cache(maxsize=2**16)
 def _called(attributes: str) -> tuple[tuple[str, str], ...]:
-    # The settings of a backend come last, and hold no computations.
+    # Backend settings come last, and contain no computations.
     head = attributes.partition("backend_config=")[0]
     return tuple(
         (key, name)

@@ -1,7 +1,7 @@
-"""Cycles of Pallas kernels on a TPU, which libtpu does not estimate in the program's text.
+"""Count cycles of Pallas kernels on a TPU, which libtpu doesn't estimate in the program's text.
 
-libtpu writes down how many bundles each operation was scheduled as. A TPU issues one bundle a
-cycle, so that bundles times grid steps are a kernel's cycles, if it never waits for memory.
+libtpu logs how many bundles each operation was scheduled as. A TPU issues one bundle per cycle, so
+bundles times grid steps are a kernel's cycles, if it never waits for memory.
 """
 
 import atexit
@@ -29,7 +29,7 @@ _BUNDLES = re.compile(r"non empty scheduled bundles:\s*(\d+)")
 
 @functools.cache
 def dump_folder() -> pathlib.Path:
-    """Make the folder that libtpu writes into, once, before it is loaded; the exit removes it."""
+    """Make the folder that libtpu writes to, once, before libtpu is loaded; removed at exit."""
     folder = pathlib.Path(tempfile.mkdtemp(prefix="crisalad-kernels-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     given = os.environ.get("LIBTPU_INIT_ARGS", "")
@@ -41,7 +41,7 @@ def dump_folder() -> pathlib.Path:
 def kernel_cycles(module: Module) -> Mapping[str, int]:
     """Return the cycles of the kernels of the program that was compiled last, by name.
 
-    Kernels of which libtpu wrote nothing are missing, as where it was loaded before
+    Kernels for which libtpu wrote nothing are missing, for example if it was loaded before
     `dump_folder`.
     """
     bundles = {}
@@ -71,7 +71,7 @@ def _body(kernel: Operation) -> str:
 def _grid_steps(body: str) -> int:
     """Read the number of a kernel's grid steps from its body, a Mosaic module in MLIR bytecode.
 
-    JAX has no public reader of it.
+    JAX has no public reader for it.
     """
     from jax._src.lib import tpu  # pyright: ignore[reportPrivateImportUsage]
     from jax._src.lib.mlir import ir  # pyright: ignore[reportPrivateImportUsage]

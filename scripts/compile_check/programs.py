@@ -1,4 +1,4 @@
-"""Lower this package's programs for machines that are not here."""
+"""Lower this package's programs for absent machines."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,22 +23,22 @@ _TARGETS = {"tpu": TPU, "cuda": GPU}
 def compile_program(
     program: str, machine: Machine, config: TrainConfig, images: int
 ) -> jax.stages.Compiled:
-    """Compile a program for the devices of a machine, which need not be here.
+    """Compile a program for the devices of a machine, which may be absent.
 
-    Arrays are placed as by `crisalad train` and `extract`: images over all devices, and the rest on
-    each of them.
+    Arrays are placed as in `crisalad train` and `extract`: images are sharded over all devices, and
+    the rest is replicated.
 
     Args:
         program: "describe" or "train".
-        machine: what to compile for.
-        config: the model, and how it trains.
-        images: number of images in the batch, on all devices together.
+        machine: the machine to compile for.
+        config: the model and its training.
+        images: number of images in the batch, over all devices.
 
     Returns:
-        The compiled program, which cannot run here.
+        The compiled program, which can't run here.
 
     Raises:
-        InputError: the devices cannot share the images, or the compiler does not know the machine.
+        InputError: the devices can't share the images, or the compiler doesn't know the machine.
     """
     machine.check_batch(images)
     mesh = Mesh(np.array(devices_of(machine)), ("image",))
@@ -50,11 +50,11 @@ def compile_program(
 
 @contextlib.contextmanager
 def _without_cache() -> Iterator[None]:
-    """Compile anew while the block runs: the cache cannot load a program for an absent device."""
+    """Disable the compile cache, which can't load a program for an absent device."""
     was: Any = jax.config.jax_enable_compilation_cache  # pyright: ignore
     try:
         jax.config.update("jax_enable_compilation_cache", False)
-        compilation_cache.reset_cache()  # JAX looks once whether it is enabled
+        compilation_cache.reset_cache()  # JAX checks only once whether it is enabled
         yield
     finally:
         jax.config.update("jax_enable_compilation_cache", was)

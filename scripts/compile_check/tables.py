@@ -1,4 +1,4 @@
-"""What was compiled, as a table for the terminal and for a page."""
+"""Tables of compiled programs, for the terminal and for a page."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ _MADE_OF = ("aliased, MB", "collectives", "bf16 sums", "fused attention", "host 
 COLUMNS = (*_NAMES, *_TAKES, *_MADE_OF)
 TAKES, MADE_OF = (*_NAMES, *_TAKES), (*_NAMES, *_MADE_OF)
 LABELS = 2
-"""Number of columns of words, before those of numbers."""
+"""Number of text columns, before those of numbers."""
 _SHORT = {
     **{"all-reduce": "reduce", "all-gather": "gather", "reduce-scatter": "scatter"},
     **{"all-to-all": "to-all", "collective-permute": "permute"},
@@ -48,7 +48,7 @@ def cells(check: ProgramCheck) -> tuple[str, ...]:
 
 
 def rounded(value: float) -> int:
-    """Round to two significant digits, which is more than a model of time has."""
+    """Round to two significant digits; the model of time is less accurate than that."""
     digits = 10 ** max(0, math.floor(math.log10(value)) - 1) if value >= 1 else 1
     return round(value / digits) * digits
 
@@ -58,7 +58,7 @@ def _digits(value: float) -> str:
 
 
 def check_tables(check: CompileCheck) -> list[Table]:
-    """Make the tables for the terminal: what a program takes, and what it is made of."""
+    """Make the tables for the terminal: the resources of each program, and its operations."""
     return [_table(check, columns) for columns in (TAKES, MADE_OF)]
 
 
@@ -75,7 +75,7 @@ def _table(check: CompileCheck, columns: Sequence[str]) -> Table:
 
 
 def markdown_table(programs: Sequence[ProgramCheck], columns: Sequence[str] = COLUMNS) -> str:
-    """Write the table, or some of its columns, as Markdown."""
+    """Format the table, or some of its columns, as Markdown."""
     chosen = [COLUMNS.index(name) for name in columns]
     rule = ["---" if position < LABELS else "---:" for position in chosen]
     rows = [[COLUMNS[position] for position in chosen], rule]

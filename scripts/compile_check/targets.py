@@ -1,6 +1,7 @@
-"""Machines to compile for: topologies for XLA, and what their makers say of the cards.
+"""Machines to compile for: topologies for XLA, and published figures of the cards.
 
-Every figure is of one device, as JAX counts them. Rates are peaks, in operations or bytes a second.
+Every figure is per device, as JAX counts devices. Rates are peaks, in operations or bytes per
+second.
 """
 
 import dataclasses
@@ -18,10 +19,10 @@ from crisalad_jax.utils.errors import InputError
 from scripts.compile_check.kernels import dump_folder
 
 _TPU_ENVIRONMENT = {
-    "TPU_SKIP_MDS_QUERY": "1",  # else libtpu asks the cloud which machine this is
+    "TPU_SKIP_MDS_QUERY": "1",  # otherwise libtpu asks the cloud which machine this is
     "TPU_ACCELERATOR_TYPE": "v5litepod-8",
     "TPU_WORKER_HOSTNAMES": "localhost",
-    "ALLOW_MULTIPLE_LIBTPU_LOAD": "1",  # else one process at a time
+    "ALLOW_MULTIPLE_LIBTPU_LOAD": "1",  # otherwise only one process at a time can load it
 }
 _H100 = pathlib.Path(__file__).with_name("h100_sxm.txtpb")
 
@@ -32,40 +33,40 @@ class Card:
 
     name: str
     peaks: Mapping[str, float]
-    """Operations a second of products by the type of their operands, as `counts.Work.flops`."""
+    """Operations per second of products, by operand type as in `counts.Work.flops`."""
     bandwidth: float
-    """Bytes a second of HBM."""
+    """HBM bandwidth in bytes per second."""
     memory: float
-    """Bytes of HBM."""
+    """HBM size in bytes."""
     link: float
-    """Bytes a second to other devices of the same machine or slice, in one direction."""
+    """Bytes per second to other devices of the same machine or slice, in one direction."""
     source: str
-    """Where the figures are published."""
+    """Source of the figures."""
     clock: float | None = None
-    """Cycles a second of a TPU, which its compiler's estimates are in; None of a GPU."""
+    """Cycles per second of a TPU, the unit of its compiler's estimates; None for a GPU."""
 
     def seconds(self, flops: Mapping[str, int], moved: float) -> float:
-        """Return the roofline of an operation: the longer of its products and its traffic."""
+        """Return the roofline time of an operation: the larger of its compute and memory time."""
         products = sum(n / self.peaks.get(kind, self.peaks["f32"]) for kind, n in flops.items())
         return max(products, moved / self.bandwidth)
 
 
 def _tpu(name: str, peak: float, per_cycle: int, **facts: Any) -> Card:
-    """Make a TPU's card: products of float32 are one, three or six of bfloat16, by precision."""
+    """Make a TPU: a float32 product takes one, three or six bfloat16 ones, depending on precision."""
     peaks = {"bf16": peak, "f32": peak, "f32:high": peak / 3, "f32:highest": peak / 6}
     page = f"https://cloud.google.com/tpu/docs/{name.removeprefix('TPU ')}"
     return Card(name, MappingProxyType(peaks), source=page, clock=peak / per_cycle, **facts)
 
 
-# The operations of a cycle are those that libtpu's estimate of a large product comes near to: v5e
-# 0.88, v6e 0.70 of them. Divided into the published peak, they give the clock.
+# Operations per cycle are chosen so that libtpu's estimate of a large product comes close to them:
+# 0.88 of them for v5e, 0.70 for v6e. The published peak divided by them gives the clock.
 V4 = _tpu("TPU v4", 275e12, 262144, bandwidth=1200e9, memory=32 * 2**30, link=300e9)
 V5E = _tpu("TPU v5e", 197e12, 131072, bandwidth=819e9, memory=16e9, link=200e9)
 V5P = _tpu("TPU v5p", 459e12, 262144, bandwidth=2765e9, memory=95e9, link=600e9)
 V6E = _tpu("TPU v6e", 918e12, 524288, bandwidth=1638e9, memory=32e9, link=400e9)
 H100 = Card(
     "H100 SXM 80 GB",
-    # Dense. float32 is TF32 by default, three such products at "high", and no tensor core at
+    # Dense. float32 is TF32 by default, three TF32 products at "high", and without tensor cores at
     # "highest".
     MappingProxyType(
         {
@@ -87,14 +88,14 @@ class Machine:
     card: Card
     platform: Literal["tpu", "cuda"]
     topology: str
-    """As libtpu, or XLA's compiler for GPUs, names it."""
+    """Its name for libtpu or XLA's GPU compiler."""
     devices: int
-    """How many of its devices share a batch."""
+    """Number of its devices that share a batch."""
     chip_config: str | None = None
-    """libtpu's name of how the two cores of a chip work together; None is its default."""
+    """libtpu's name for the way in which a chip's two cores cooperate; None is its default."""
 
     def check_batch(self, images: int) -> None:
-        """Raise InputError where the devices cannot share so many images equally."""
+        """Raise InputError if the devices can't share the images equally."""
         require(images > 0, f"batch size: found {images} images, expected at least 1")
         require(
             images % self.devices == 0,
@@ -104,7 +105,7 @@ class Machine:
 
 
 MACHINES: Mapping[str, Machine] = {
-    # libtpu has no slice of one chip: the others are left out.
+    # libtpu has no slice of one chip, so the other chips stay unused.
     "v5e-1": Machine(V5E, "tpu", "v5e:2x2", 1),
     "v5e-8": Machine(V5E, "tpu", "v5e:2x4", 8),
     "v5e-64": Machine(V5E, "tpu", "v5e:8x8", 64),
@@ -116,23 +117,23 @@ MACHINES: Mapping[str, Machine] = {
     "h100": Machine(H100, "cuda", "1x1x1", 1),
     "h100-8": Machine(H100, "cuda", "1x1x8", 8),
 }
-"""Machines by name, with the number of devices, or of one host."""
+"""Machines by name, with the number of devices; without a number, one host."""
 
 COMPILER_OPTIONS: Mapping[str, dict[str, Any]] = {
     "tpu": {},
-    # Tuning runs kernels on the card, which is not here.
+    # Autotuning would run kernels on the absent card.
     "cuda": {"xla_gpu_enable_triton_gemm": False, "xla_gpu_autotune_level": 0},
 }
-"""XLA's options by platform."""
+"""XLA options by platform."""
 _COMPILERS = {"tpu": ("libtpu",), "cuda": ("jax_plugins.xla_cuda12", "jax_plugins.xla_cuda13")}
 _PACKAGES = {"tpu": f"jax[tpu]=={jax.__version__}", "cuda": f"jax-cuda12-plugin=={jax.__version__}"}
-"""What brings them, of the version of JAX that they belong to. On Linux alone."""
+"""Packages with the compilers, for the installed version of JAX. Only on Linux."""
 
 
 def compile_on_cpu() -> None:
-    """Let JAX look for no GPU, before it is first used: nothing runs, and the plug-in would fail.
+    """Restrict JAX to the CPU before its first use, because the GPU plug-in would fail.
 
-    An environment that names platforms is left as it is.
+    If the environment names platforms, they are left unchanged.
     """
     if not jax.config.jax_platforms:  # pyright: ignore
         jax.config.update("jax_platforms", "cpu")
@@ -142,7 +143,7 @@ def check_compiler(machine: Machine, name: str) -> None:
     """Check that XLA's compiler for a machine is installed.
 
     Raises:
-        InputError: it is not installed; the message names the package that brings it.
+        InputError: it isn't installed; the message names the package to install.
     """
     for module in _COMPILERS[machine.platform]:
         try:
@@ -158,10 +159,10 @@ def check_compiler(machine: Machine, name: str) -> None:
 
 
 def devices_of(machine: Machine) -> Sequence[Any]:
-    """Return devices of a machine that is not here, which programs can be compiled for.
+    """Return devices of an absent machine, to compile programs for.
 
     Raises:
-        InputError: the installed compiler does not know it.
+        InputError: the installed compiler doesn't know the machine.
     """
     from jax.experimental import topologies
 
@@ -176,7 +177,7 @@ def devices_of(machine: Machine) -> Sequence[Any]:
         topology = topologies.get_topology_desc(
             platform=machine.platform, topology_name=machine.topology, **options
         )
-    except Exception as error:  # jaxlib's own class, which differs by version
+    except Exception as error:  # a class of jaxlib, which differs by version
         raise InputError(
             f"{machine.card.name}: found that the installed compiler has no topology "
             f"{machine.topology} ({error}), expected that of {_PACKAGES[machine.platform]}, "

@@ -111,8 +111,8 @@ def test_ours_is_compared_with_the_fastest_of_the_others(scripts: Any) -> None:
         "torch eager": "500 (500 to 8000)",
         "OpenVINO": "1000 (889 to 1143)",
         "ours": "800 (800 to 800)",
-        "ours: times the fastest other": "0.80 (0.70 to 0.90)",
-        "ours: of the machine": "50 %",
+        "ours: speedup over the fastest other": "0.80 (0.70 to 0.90)",
+        "ours: share of the machine": "50 %",
     }
     (row,) = bench.costs(race, "Costs.").rows
     assert row[3:] == ("1.5 s", "1.5 s", "1.5 s, 2.0 MB")
@@ -337,7 +337,7 @@ def test_the_search_is_measured(
         ("bench_loader", "--batch 6", "found 960 images in batches of 6, expected a multiple of"),
         ("bench_memory", "--images 190", "found 190 images, expected a multiple of 4"),
         ("bench_overlap", "--steps 4", "found 4 steps of 48 images, expected more than 4 steps"),
-        ("bench_search", "nothing", "found nothing, expected of bench_search, search_memory"),
+        ("bench_search", "nothing", "found nothing, expected some of bench_search, search_memory"),
         ("bench_search", "--memory-rows 9000000000", "GB free, expected 304128.0 GB"),
         ("bench_sinkhorn", "--calls -1", "argument --calls: found '-1'"),
     ],
