@@ -18,7 +18,7 @@ import crisalad_jax as cj
 @cj.register_aggregator("attention-pool", tiny={"heads": 2})
 @dataclasses.dataclass(frozen=True)
 class AttentionPool(cj.Aggregator):
-    """A softmax over patches for each head; the concatenated means of all heads are the descriptor."""
+    """A softmax over patches for each head; the descriptor concatenates the means of all heads."""
 
     heads: int = 4
 

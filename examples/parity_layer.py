@@ -1,7 +1,7 @@
 """Compare one layer with torch: the cross-image encoder's is `nn.TransformerEncoderLayer`.
 
-Weights are copied, then outputs and all gradients are compared. Torch stores a linear layer's weight
-transposed. `parity/` does this for the whole model. It needs torch: `pip install torch`.
+Weights are copied, then outputs and all gradients are compared. Torch stores the weight of a linear
+layer transposed. `parity/` does this for the whole model. It needs torch: `pip install torch`.
 
     python examples/parity_layer.py
 """

@@ -29,8 +29,8 @@ class Parity:
     precision: str = ",".join(PRECISIONS)
     """Comma-separated precisions."""
     full_size: bool = False
-    """Also compare ViT-B/14 with random weights, at 224 x 224, 322 x 322 and 224 x 308; and in float32
-    each published network with outputs of its authors' code. Needs up to 6 GB."""
+    """Also compare ViT-B/14 with random weights, at 224 x 224, 322 x 322 and 224 x 308; and in
+    float32 each published network with outputs of its authors' code. Needs up to 6 GB."""
     only: str = ""
     """Only rows whose name contains this, ignoring case."""
     seed: int = 0

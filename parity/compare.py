@@ -307,7 +307,7 @@ def compare_truth(
     theirs: Arrays,
     truth: Arrays,
 ) -> Row:
-    """Make the row of our error relative to a truth, all arrays joined, compared with torch's error.
+    """Make the row that compares our error from a truth with torch's, all arrays joined.
 
     If torch's error is NaN, there is no bound, and the row misses.
     """

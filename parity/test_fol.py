@@ -152,5 +152,5 @@ def test_the_class_tokens_attention_is_transformers(kind: Kind, tmp_path: pathli
 
     found, change = features(jnp.asarray(images))
     assert relative_error(found, expected) < OUTPUT_BOUND
-    # Returning attention changes features only by float32 rounding, as programs are split differently.
+    # Returning attention changes features only by float32 rounding of a differently split program.
     assert float(jnp.abs(change).max()) < 1e-4

@@ -1,10 +1,10 @@
 """Compare with independent libraries: Hugging Face's transformers and torch's encoder.
 
 Weights are random and reach transformers through files, both ways, so that transformers supplies
-the public names. Errors are the norm of the difference over the norm, array by array. In float32 the bounds are
-those of the stored outputs (test_goldens.py), 1e-5, and 1e-4 on gradients: eight and twenty times
-the errors measured here, 1.2e-6 and 5e-6, from roundings of 6e-8 along two blocks and back. A
-wrong constant or axis shows at 1e-3 and more.
+the public names. Errors are the norm of the difference over the norm, array by array. In float32
+the bounds are those of the stored outputs (test_goldens.py), 1e-5, and 1e-4 on gradients: eight and
+twenty times the errors measured here, 1.2e-6 and 5e-6, from roundings of 6e-8 along two blocks and
+back. A wrong constant or axis shows at 1e-3 and more.
 """
 
 import copy
@@ -268,10 +268,10 @@ def test_transformers_interpolates_without_the_offset(
 def test_training_is_that_of_the_libraries(tmp_path: pathlib.Path) -> None:
     """Compare 20 steps of `train_step` with a training that uses none of our code.
 
-    There, the model is from transformers, the miner and loss from pytorch-metric-learning, AdamW and
-    its linear decay from torch. It runs in float64, because AdamW would otherwise turn the signs of
-    rounding noise into steps. Bytes of 0 and 255, and a rate and decay steps that are powers of 2,
-    are exact in every precision.
+    There, the model is from transformers, the miner and loss from pytorch-metric-learning, and
+    AdamW and its linear decay from torch. It runs in float64, because AdamW would otherwise turn
+    the signs of rounding noise into steps. Bytes of 0 and 255, and a rate and decay steps that are
+    powers of 2, are exact in every precision.
     """
     steps, planned, rate, weight_decay = 20, 32, 2**-10, 0.5
     labels = np.array([0, 0, 1, 1, 2, 2], np.int32)
@@ -335,9 +335,9 @@ def test_training_is_that_of_the_libraries(tmp_path: pathlib.Path) -> None:
             assert way == 0
             np.testing.assert_array_equal(ours[name], array)
             continue
-        # Relative to the distance from the start, at least 0.7% of the arrays' norms. Measured 4e-13,
-        # and 1e-9 for what softmax absorbs: its gradients are noise, but not negligible compared
-        # with AdamW's epsilon of 1e-8.
+        # Relative to the distance from the start, at least 0.7% of the arrays' norms. Measured
+        # 4e-13, and 1e-9 for what softmax absorbs: its gradients are noise, but not negligible
+        # compared with AdamW's epsilon of 1e-8.
         assert way > 5e-3 * np.linalg.norm(array), name
         bound = 1e-7 if name.endswith("key.bias") else 1e-10
         assert np.linalg.norm(ours[name] - array) < bound * way, name

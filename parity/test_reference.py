@@ -163,8 +163,8 @@ def test_salad() -> None:
             cross_image="none",
         )
     )
-    # A cluster's potential absorbs a constant added to its scores: the dustbin's score and the score
-    # network's last bias have no effect, and their gradients are rounding noise.
+    # A cluster's potential absorbs a constant added to its scores: the dustbin's score and the
+    # score network's last bias have no effect, and their gradients are rounding noise.
     dead = ("dust_bin", "score.3.bias")
     check(salad, golden, inputs, {"descriptor": model.attend_across_images(tokens)}, exempt=dead)
     plan = salad.transport(inputs["features"]).exp()

@@ -272,8 +272,8 @@ def test_the_float_model_has_the_weights_of_the_model_with_bits(size: str) -> No
 def test_windows_are_the_public_codes(name: str) -> None:
     """Windows are stored in float16, with an error of 2e-4 of their norm.
 
-    The public code's float32 sums over whole images have an error of up to 1.4e-4 at side 2. Descriptors of
-    neighbouring windows differ by 0.2 and more.
+    The public code's float32 sums over whole images have an error of up to 1.4e-4 at side 2.
+    Descriptors of neighbouring windows differ by 0.2 and more.
     """
     state, golden = zoo.random_state(name), zoo.golden(name)
     layout, config = infer(state, source=name)

@@ -53,7 +53,7 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def load(folder: pathlib.Path, manifest: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
-    """Load the function from images (batch, height, width, 3), of the manifest's type, to descriptors."""
+    """Load the function from images (batch, height, width, 3) to descriptors."""
     program = jax.export.deserialize(bytearray(read_whole(folder, manifest["program"])))
     if manifest["weights"] is None:
         return lambda images: np.asarray(program.call(images))

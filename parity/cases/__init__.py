@@ -121,7 +121,7 @@ def pixels(*shape: int) -> Draw:
 def similarities(looks: Sequence[int]) -> Draw:
     """Draw inner products of images that look similar if they have the same number in `looks`.
 
-    An image that looks like another place yields some pairs that a miner selects, and some it skips.
+    An image that looks like another place yields pairs that a miner selects, and others it skips.
     """
 
     def draw(rng: np.random.Generator) -> np.ndarray:

@@ -47,8 +47,8 @@ ONE_STEP = OptimiserConfig(learning_rate=1e-2)
 SLOPE = 1e-4
 """Size of the gradients that flow into a case: small, so that AdamW's epsilon of 1e-8 matters.
 
-Doubling the epsilon changes the MLP's step by 1.6 %; with 1 here, it would change by an undetectable
-1e-5.
+Doubling the epsilon changes the MLP's step by 1.6 %; with 1 here, the change would be 1e-5, and
+undetected.
 """
 
 Draw = Callable[[np.random.Generator], np.ndarray]
@@ -62,7 +62,7 @@ class Case:
     model: ModelConfig
     part: Part
     inputs: Mapping[str, Draw] = dataclasses.field(default_factory=dict)
-    """How each input is drawn. Real numbers are cast to the precision's type, and have gradients."""
+    """How each input is drawn. Real numbers get the precision's type, and have gradients."""
     forward: str = "layer"
     """Tolerance for the outputs: "layer" or "descriptor"."""
     bfloat16: bool = True
@@ -205,7 +205,7 @@ def _rounded(array: np.ndarray) -> np.ndarray:
 
 
 def _gradients(ours: Pass, theirs: Pass) -> tuple[Arrays, Arrays]:
-    """Collect the gradients of everything that either side uses, 0 on a side that does not use it."""
+    """Collect gradients of everything that either side uses; 0 on a side that does not use it."""
     mine, other = ({**split(x.parameters), **x.inputs} for x in (ours, theirs))
     names = {**other, **mine}
 

@@ -78,7 +78,7 @@ def _their_pixels(model: TorchCrisalad, x: Inputs, _: ModelConfig) -> dict[str, 
 
 
 def torch_normalise(images: Tensor, dtype: torch.dtype) -> Tensor:
-    """Normalise 8-bit (..., 3) like torchvision's `to_tensor` and `normalize`, with channels last."""
+    """Normalise 8-bit (..., 3) like torchvision's `to_tensor` and `normalize`, channels last."""
     mean, deviation = (torch.tensor(x, dtype=dtype) for x in (MEAN, DEVIATION))
     return (images.to(dtype) / 255 - mean) / deviation
 

@@ -50,7 +50,7 @@ class Batch(NamedTuple):
 
 
 def check_run(run: Run, precision: str, seed: int) -> list[Row]:
-    """Compare losses, final parameters and running statistics, and check that the rest is frozen."""
+    """Compare losses, final parameters and statistics, and check that the rest is frozen."""
     rng = random(run.name, seed)
     model = build(run.model, precision, rng)
     batches = [_batch(run, step, rng) for step in range(STEPS)]

@@ -99,7 +99,7 @@ class Crisalad(nn.Module):
         return self.attend_across_images(self.extract_tokens(images), mask)
 
     def extract_tokens(self, images: Tensor) -> Tokens:
-        """Compute every image's tokens, independent of other images: the first half of `forward`."""
+        """Compute each image's tokens, independent of others: the first half of `forward`."""
         self.config.check_image_size((images.shape[2], images.shape[3]))
         images = images.to(self.compute_dtype)
         if not isinstance(self.backbone, ViT):

@@ -28,7 +28,7 @@ class Salad(nn.Module):
         self.dust_bin = nn.Parameter(torch.ones(()))
 
     def forward(self, features: Features) -> Tokens:
-        """Compute global and cluster tokens (paper Eq. 6), each L2-normalised, in at least float32."""
+        """Compute L2-normalised global and cluster tokens (paper Eq. 6), in at least float32."""
         global_token = at_least_float32(self.token_features(features.class_token))
         local = at_least_float32(self.cluster_features(features.patches)).flatten(2)
         plan = self.transport(features.patches)[:, :-1].exp()

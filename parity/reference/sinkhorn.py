@@ -1,6 +1,7 @@
 """Sinkhorn in the log domain, with a dustbin (Cuturi 2013; Sarlin et al. 2020; SALAD, CVPR 2024).
 
-The layout is as published, clusters in rows and patches in columns: the transpose of `crisalad_jax`.
+The layout is as published, with clusters in rows and patches in columns: the transpose of
+`crisalad_jax`.
 """
 
 import math

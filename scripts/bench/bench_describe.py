@@ -360,7 +360,7 @@ def report(name: str, what: str, values: Sequence[Value], arguments: argparse.Na
 
 
 def in_order(values: Sequence[Value]) -> list[Value]:
-    """Sort by model in the order of `MODELS`, size, type and batch; keep the order of contenders."""
+    """Sort by model as in `MODELS`, size, type and batch, without reordering contenders."""
     models = list(MODELS)
 
     def place(value: Value) -> tuple[int, str, bool, int]:

@@ -201,8 +201,8 @@ def main() -> None:
     ]
     caption = (
         f"Training batches of {arguments.batch} images with RandAugment from JPEGs of three sizes, "
-        f"no model; {measured(arguments.rounds)} of an epoch of {arguments.images} images. Speedup: "
-        "over a DataLoader with Pillow on the same number of cores."
+        f"no model; {measured(arguments.rounds)} of an epoch of {arguments.images} images. "
+        "Speedup: over a DataLoader with Pillow on the same number of cores."
     )
     header = ("files", "cores", "contender", "speedup")
     fewest = [value for value in values if value["cores"] == len(ONE_AND_ALL[0])]

@@ -152,8 +152,8 @@ def recall(arguments: argparse.Namespace) -> Study:
                 (dtype, result.grouping, *found, f"{alike.mean():.5f}", f"{alike.min():.5f}")
             )
     caption = (
-        f"Recall@K of a trained model on {benchmark.name}, {len(benchmark.queries)} queries; cosines "
-        f"of the queries' descriptors (single) to those in float32. {machine()}."
+        f"Recall@K of a trained model on {benchmark.name}, {len(benchmark.queries)} queries; "
+        f"cosines of the queries' descriptors (single) to those in float32. {machine()}."
     )
     header = ("type", "grouping", "R@1", "R@5", "R@10", "mean cosine", "smallest cosine")
     figure = bars(values, lambda v: v["grouping"], "R@1", "Recall@1")

@@ -93,8 +93,8 @@ def main() -> None:
         rows.append((value["preset"], f"{100 * loader / step:.1f} %", f"{100 * waited:.1f} %"))
     caption = (
         f"Training steps of {arguments.batch} images with RandAugment from JPEGs of 400 x 300, "
-        f"medians of {arguments.rounds} runs of {arguments.steps} steps: the loader's time alone and "
-        "the time that a step waits for it, both as shares of the step's time."
+        f"medians of {arguments.rounds} runs of {arguments.steps} steps: the loader's time alone "
+        "and the time that a step waits for it, both as shares of the step's time."
     )
     header = ("model", "loader alone", "waiting in training")
     leave("bench_overlap", Study(Table(header, rows, caption), values), arguments)

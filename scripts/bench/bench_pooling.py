@@ -73,7 +73,10 @@ def main() -> None:
             slower = times(ratio(one, timed[OURS]))
             values.append({"maps": name, "contender": contender, "ms": one.rounds})
             rows.append((name, contender, slower))
-    caption = f"Max pooling, 3 x 3 with stride 2, forward and backward, float32, {measured(arguments.rounds)}."
+    caption = (
+        "Max pooling, 3 x 3 with stride 2, forward and backward, float32, "
+        f"{measured(arguments.rounds)}."
+    )
     table = Table(("maps", "implementation", "time relative to ours"), rows, caption, 2)
     leave("bench_pooling", Study(table, values), arguments)
 

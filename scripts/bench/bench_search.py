@@ -209,7 +209,7 @@ def streets(generator: np.random.Generator, rows: int, length: int) -> np.ndarra
 
 
 def views(generator: np.random.Generator, places: np.ndarray, rows: int) -> np.ndarray:
-    """Draw views of places: some places have hundreds, most a dozen, and some views are outliers."""
+    """Draw views of places: some places have hundreds, most a dozen; some views are outliers."""
     drawn = (generator.random(rows) ** 2 * len(places)).astype(int)
     spread = generator.uniform(*SPREAD, (rows, 1)).astype(np.float32)
     return unit(places[drawn] + spread * components(generator, rows, places.shape[1]))
@@ -273,8 +273,8 @@ def approximate(arguments: argparse.Namespace) -> Study:
     ]
     caption = (
         f"Search of {K} neighbours of {arguments.queries:,} queries among {count:,} descriptors of "
-        f"{length} dimensions, {VIEWS} views per place; {measured(arguments.rounds)}. Recall is the "
-        "share of the exact neighbours that were found, and the share that is among the best "
+        f"{length} dimensions, {VIEWS} views per place; {measured(arguments.rounds)}. Recall is "
+        "the share of the exact neighbours that were found, and the share that is among the best "
         f"{5 * K}, for exact ranking; building time is relative to the exact search of all queries."
     )
     header = (

@@ -86,7 +86,7 @@ class Entry(NamedTuple):
 
 
 def by_jax(name: str, log_plan: LogPlan) -> Entry:
-    """Make an entry of `log_plan`, from scores and dustbin score to (images, patches, clusters + 1)."""
+    """Make an entry of `log_plan`: scores and dustbin score to (images, patches, clusters + 1)."""
 
     def loss(scores: jax.Array, dustbin: jax.Array, weights: jax.Array) -> jax.Array:
         return (weights * jnp.exp(log_plan(scores, dustbin)[..., :-1])).sum()

@@ -55,7 +55,7 @@ from parity.reference.training import clip_gradients, freeze
 
 IMAGES_PER_PLACE = 4
 LOSS_TOLERANCES = {"float32": 1e-4, "bfloat16": 5e-2}
-"""Relative bounds: similarities differ by 1e-6 and 1e-3, times the loss's largest exponent of 50."""
+"""Relative bounds: similarities differ by 1e-6 and 1e-3, times the loss's exponents up to 50."""
 STEPS = 1000
 """Length of the schedule: longer than any race."""
 

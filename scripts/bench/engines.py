@@ -121,7 +121,7 @@ def peers(model: Crisalad, images: torch.Tensor, dtype: str) -> dict[str, Peer]:
 
 
 def product_rate(dtype: str) -> float:
-    """Measure the floating-point operations per second of the fastest matrix product of any engine."""
+    """Measure floating-point operations per second of the fastest matrix product of any engine."""
     best = 0.0
     for rows, width, columns in PRODUCTS:
         timed = race(_products(rows, width, columns, dtype), rounds=3, calls=3)

@@ -5,8 +5,8 @@
 claims: every row of `docs/claims/claims.toml`. models: their licence, descriptor length and
 parameters from the table of published models, and the speed that `bench_claims.py` measured.
 leakage: the information that leaks between images of a batch in the published evaluations of models
-whose images attend to each other, computed only from their rules: which frames are correct, in which
-order they come, and how many are in a batch.
+whose images attend to each other, computed only from their rules: which frames are correct, in
+which order they come, and how many are in a batch.
 """
 
 import json
@@ -102,7 +102,7 @@ def models() -> Study:
 
 
 def best() -> str:
-    """List the rows with the highest mean of Pitts30k and MSLS for independent images, with speeds."""
+    """List rows with the highest mean of Pitts30k and MSLS on independent images, with speeds."""
     speeds = measured()["images_per_second"]
     alone = [
         row

@@ -63,7 +63,7 @@ CASES = [
 
 
 def run(python: str, case: Program, choices: dict[str, Any], rounds: int) -> dict[str, Any]:
-    """Run `compiled_by.py`, and return its results by choice; `failed` for those that crashed it."""
+    """Run `compiled_by.py`, and return its results by choice; `failed` for those that crashed."""
     asked = json.dumps(case._asdict() | {"choices": choices, "rounds": rounds})
     path = os.pathsep.join([str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
@@ -117,8 +117,9 @@ def main() -> None:
             (words, "images per second of the fastest", *(f"{b:.3g}" for b in best.values()))
         )
     caption = (
-        "Programs by XLA options and JAX version: speed relative to the fastest options, seconds of "
-        f"the first call, MB. {processor()}, {CORES} cores; medians of {arguments.rounds} rounds."
+        "Programs by XLA options and JAX version: speed relative to the fastest options, seconds "
+        f"of the first call, MB. {processor()}, {CORES} cores; "
+        f"medians of {arguments.rounds} rounds."
     )
     table = Table(("program", "options", *(f"jax {v}" for v in versions)), rows, caption, 2)
     leave("study_compiler", Study(table, values), arguments)

@@ -2,9 +2,9 @@
 
     python scripts/bench/study_kernels.py [--target v5e-1] [--program describe] [--images 192]
 
-`b14` in bfloat16 is compiled with each kernel in place of ours, and libtpu's estimate is read in the
-same way as in `scripts.compile_check`, with the same requirements. JAX's kernels take whole blocks
-of 128 tokens with the head axis first, so 257 tokens are padded to 384.
+`b14` in bfloat16 is compiled with each kernel in place of ours, and libtpu's estimate is read in
+the same way as in `scripts.compile_check`, with the same requirements. JAX's kernels take whole
+blocks of 128 tokens with the head axis first, so 257 tokens are padded to 384.
 """
 
 import argparse

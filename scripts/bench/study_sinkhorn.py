@@ -438,8 +438,8 @@ def precision(size: Size) -> Study:
     axes[0].set_ylabel("largest error in the plan")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     caption = (
-        "Largest difference of the plan of 3 iterations from the float64 plan, whose entries are at "
-        f'most 1: median of {size.images} images (and the worst). "Inside": every '
+        "Largest difference of the plan of 3 iterations from the float64 plan, whose entries are "
+        f'at most 1: median of {size.images} images (and the worst). "Inside": every '
         "intermediate result of the transport is rounded to that format."
     )
     header = ("scores", "std", *ways)

@@ -1,11 +1,11 @@
 """Time programs side by side in one run.
 
-Fairness: the contenders take turns, `rounds` times. A turn is a pause of a quarter of a second, in
-which the previous contender's threads stop spinning (OpenMP threads spin after each call); a quarter
-of a second of calls that do not count, so that cores and caches are equally warm for fast and slow
-contenders; then a quarter of a second, and at least `calls`, of calls that count. A ratio is between
-two medians of the same round; tables show the median of the ratios over rounds, and the range. All
-contenders may use any number of threads.
+Fairness: the contenders take turns, `rounds` times. A turn has three parts: a pause of a quarter of
+a second, in which the previous contender's threads stop spinning (OpenMP threads spin after each
+call); a quarter of a second of calls that do not count, so that cores and caches are equally warm
+for fast and slow contenders; then calls that count, for a quarter of a second and at least `calls`
+of them. A ratio is between two medians of the same round; tables show the median of the ratios over
+rounds, and the range. All contenders may use any number of threads.
 """
 
 import importlib.metadata

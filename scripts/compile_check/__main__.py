@@ -27,8 +27,8 @@ class CompileCheck:
 
     settings: Any
     targets: tuple[str, ...] = ("v5e-1", "v5e-8", "v6e-8", "h100", "h100-8")
-    """Machines: v4, v5p, v5e-1, v5e-8, v5e-64, v5e-256, v6e-1, v6e-8, h100, h100-8. The suffix is the
-    number of devices; v4 and v5p are a host with four."""
+    """Machines: v4, v5p, v5e-1, v5e-8, v5e-64, v5e-256, v6e-1, v6e-8, h100, h100-8. The suffix is
+    the number of devices; v4 and v5p are a host with four."""
     programs: tuple[str, ...] = ("describe", "train")
     """describe, train or both."""
     preset: str = "b14"
@@ -42,8 +42,8 @@ class CompileCheck:
     batch_size: int | None = None
     """Number of images in a batch, over all devices; by default that of a training step."""
     expect: pathlib.Path | None = None
-    """JSON of an earlier check to compare with: memory and operations within 5 %, and equal counts of
-    collectives, sums in bfloat16, calls of fused attention and host callbacks."""
+    """JSON of an earlier check to compare with: memory and operations within 5 %, and equal counts
+    of collectives, sums in bfloat16, calls of fused attention and host callbacks."""
     keep: pathlib.Path | None = None
     """Existing folder for the HLO text of the compiled programs."""
     json: Annotated[pathlib.Path | None, Target((".json",))] = None

@@ -52,7 +52,7 @@ class Card:
 
 
 def _tpu(name: str, peak: float, per_cycle: int, **facts: Any) -> Card:
-    """Make a TPU: a float32 product takes one, three or six bfloat16 ones, depending on precision."""
+    """Make a TPU: a float32 product takes one, three or six of bfloat16, by precision."""
     peaks = {"bf16": peak, "f32": peak, "f32:high": peak / 3, "f32:highest": peak / 6}
     page = f"https://cloud.google.com/tpu/docs/{name.removeprefix('TPU ')}"
     return Card(name, MappingProxyType(peaks), source=page, clock=peak / per_cycle, **facts)
