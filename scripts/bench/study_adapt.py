@@ -1,19 +1,22 @@
 """Measure what a model gains at a place by `crisalad adapt`, and what it loses elsewhere.
 
-    python scripts/bench/study_adapt.py --data SET... [--weights FILE] [--seeds 3] [--frames 3]
-        [--trainable head] [--learning-rate 1e-3] [--epochs 10]
+    python scripts/bench/study_adapt.py --data SET... [--watch SET...] [--weights FILE]
+        [--seeds 3] [--frames 3] [--trainable head] [--learning-rate 1e-3] [--epochs 10]
 
 The database of each set becomes a map, to which the model is adapted once for each seed. Its
-queries, unseen in training, are evaluated before and after, and so are those of the other sets.
+queries, unseen in training, are evaluated before and after, and so are those of the other sets, also
+with weights halfway between both models.
 Intervals are 95 % paired bootstrap intervals over queries and seeds. `--frames` is for sets without
 positions.
 """
 
 import argparse
 import dataclasses
+import itertools
 import pathlib
 import tempfile
 
+import jax
 import numpy as np
 
 from crisalad_jax.checkpoints import starter
@@ -71,9 +74,17 @@ def adapted(model: Model, data: Benchmark, seed: int, given: argparse.Namespace)
         return None if found.weights is None else load(found.weights)
 
 
+def halfway(start: Model, end: Model) -> Model:
+    """Average the weights of two models, as WiSE-FT does (Wortsman et al., CVPR 2022)."""
+    return end._replace(params=jax.tree.map(lambda a, b: (a + b) / 2, start.params, end.params))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=pathlib.Path, nargs="+", required=True)
+    parser.add_argument(
+        "--watch", type=pathlib.Path, nargs="*", default=[], help="sets to evaluate only"
+    )
     parser.add_argument("--weights", type=pathlib.Path, default=starter.FILE)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=3)
@@ -82,18 +93,21 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=10)
     given = parser.parse_args()
     model, sets = load(given.weights), [open_benchmark(each) for each in given.data]
-    before = {data.name: firsts(model, data) for data in sets}
-    print("| adapted to | evaluated on | R@1 before | change of R@1 |\n| --- | --- | ---: | ---: |")
+    watched = [open_benchmark(each) for each in given.watch]
+    before = {data.name: firsts(model, data) for data in (*sets, *watched)}
+    print("| adapted to | evaluated on | weights | R@1 before | change of R@1 |")
+    print("| --- | --- | --- | ---: | ---: |", flush=True)
     for data in sets:
         models = [adapted(model, data, seed, given) or model for seed in range(given.seeds)]
-        for asked in sorted(sets, key=lambda each: each is not data):
-            hits = np.stack([firsts(each, asked) for each in models])
-            start = np.stack([before[asked.name]] * len(models))
+        rows = {"adapted": models, "halfway": [halfway(model, each) for each in models]}
+        others = [each for each in (*sets, *watched) if each is not data]
+        for on, (weights, found) in itertools.product((data, *others), rows.items()):
+            hits = np.stack([firsts(each, on) for each in found])
+            start = np.stack([before[on.name]] * len(found))
             change = paired_difference(hits, start)
             low, high = (f"{100 * each:+.1f}" for each in change.interval)
-            cells = data.name, "itself" if asked is data else asked.name
             was, now = f"{100 * start.mean():.1f}", f"{100 * change.mean:+.1f} ({low} to {high})"
-            print(f"| {' | '.join((*cells, was, now))} |", flush=True)
+            print(f"| {' | '.join((data.name, on.name, weights, was, now))} |", flush=True)
 
 
 if __name__ == "__main__":
