@@ -4,10 +4,9 @@
         [--seeds 3] [--frames 3] [--trainable head] [--learning-rate 1e-3] [--epochs 10]
 
 The database of each set becomes a map, to which the model is adapted once for each seed. Its
-queries, unseen in training, are evaluated before and after, and so are those of the other sets, also
-with weights halfway between both models.
-Intervals are 95 % paired bootstrap intervals over queries and seeds. `--frames` is for sets without
-positions.
+queries, unseen in training, are evaluated before and after, and so are those of the other sets; and
+both again with weights halfway between the two models. Intervals are 95 % paired bootstrap
+intervals over queries and seeds. `--frames` is for sets without positions.
 """
 
 import argparse
