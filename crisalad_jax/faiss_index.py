@@ -1,4 +1,4 @@
-"""Approximate search with faiss: the public face of `crisalad_jax.retrieval.faiss_index`."""
+"""Approximate search with faiss: the public API of `crisalad_jax.retrieval.faiss_index`."""
 
 from crisalad_jax.retrieval.faiss_index import Index as Index
 from crisalad_jax.retrieval.faiss_index import build as build

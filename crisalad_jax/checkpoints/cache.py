@@ -26,9 +26,9 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.version import VERSION
 
 MIRROR = "CRISALAD_MIRROR"
-"""Environment variable: where to look for files by their names before their published addresses."""
+"""Environment variable: address of a mirror, which is tried before the published addresses."""
 _RECORD = "record.json"
-"""File next to the weights of a published model in the cache."""
+"""Name of the record of a published model, next to its weights in the cache."""
 
 
 def is_cached(model: Published) -> bool:
@@ -40,15 +40,15 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
     """Return a published model's weights in the cache; download and convert them the first time.
 
     If two processes need it, one downloads and the other waits. The weights have their own
-    checksum, which `load_weights` checks. Another version of this package converts them again, and
-    compares the SHA-256 of the published file with that of the first download.
+    checksum, which `load_weights` checks. Another version of this package converts the published
+    file again, if its SHA-256 is still that of the first download.
 
     Args:
         model: the published model.
         quiet: whether to hide the progress bar.
 
     Returns:
-        A file of this package.
+        The weight file.
 
     Raises:
         InputError: what `download` and `read_checkpoint` raise; the file differs from the first
@@ -97,7 +97,7 @@ def _weights(model: Published) -> pathlib.Path:
 
 
 def _is_ready(model: Published) -> bool:
-    """Return whether the weights exist, made by this version of the package."""
+    """Return whether weights made by this version of the package exist."""
     if not _weights(model).is_file():
         return False
     # If the published file was removed to save space, they cannot be made again.
@@ -141,7 +141,7 @@ def _download(model: Published, *, quiet: bool) -> str:
         with contextlib.suppress(MissingFileError):
             download(address, target, label=model.name, quiet=quiet)
             return address
-        warn(f"{address}: found no such file; looking at {last}")
+        warn(f"{address}: found no such file; trying {last}")
     try:
         download(last, target, label=model.name, quiet=quiet)
     except MissingFileError as error:
@@ -152,7 +152,7 @@ def _download(model: Published, *, quiet: bool) -> str:
 def _convert(
     model: Published, published: pathlib.Path, address: str | None, *, quiet: bool
 ) -> None:
-    """Convert the published file to weights, and record both.
+    """Convert the published file to weights, and write its record.
 
     Args:
         model: the model.
@@ -167,8 +167,8 @@ def _convert(
     if digest != record.get("sha256", digest):
         raise InputError(
             f"{published}: found SHA-256 {digest[:12]}..., expected {record['sha256'][:12]}... as "
-            f"at the first download: the file was changed (without {published.parent} it is "
-            "downloaded again)"
+            f"at the first download: the file was changed (remove {published.parent} to "
+            "download it again)"
         )
     if model.backbone:  # a vocabulary, whose backbone is in the cache too
         backbone = cached_weights(PUBLISHED[model.backbone], quiet=quiet)
@@ -179,7 +179,7 @@ def _convert(
     found = checkpoint.config.descriptor_dim, parameters
     if found != (model.descriptor, model.parameters):
         raise InputError(
-            f"{published}: found descriptors of {found[0]} numbers and {found[1]} parameters "
+            f"{published}: found {found[0]} dimensions and {found[1]} parameters "
             f"({checkpoint.format}), expected {model.descriptor} and {model.parameters}"
         )
     extras, restriction = checkpoint.extras, model.restriction

@@ -43,7 +43,7 @@ FORMATS: Mapping[str, ProgramFormat] = {
     ),
 }
 READS: Mapping[str, tuple[str, ...]] = {"onnxruntime": ("onnx",), "openvino": ("openvino", "onnx")}
-"""Formats that an engine reads, its own first."""
+"""Formats that each engine reads, its own first."""
 _TOOLS = "openvino.tools.ovc"
 _CAPABILITIES = "OPTIMIZATION_CAPABILITIES"
 
@@ -76,7 +76,7 @@ def import_openvino() -> Any:
 
 def _openvino(path: pathlib.Path, precision: Precision) -> Program:
     openvino = import_openvino()
-    # By default it computes in fewer bits if the processor has units for them.
+    # By default it computes in lower precision if the processor supports that.
     hint = {"float32": "f32", "bfloat16": "bf16"}[precision]
     core = openvino.Core()
     if precision == "bfloat16" and "BF16" not in core.get_property("CPU", _CAPABILITIES):
@@ -91,7 +91,7 @@ def load_program(
     """Load a program into an engine, on the CPU.
 
     Args:
-        engine: its name.
+        engine: name of the engine.
         path: a .onnx file, or OpenVINO's .xml; OpenVINO reads both.
         precision: type of the matrix products; onnxruntime has only float32.
 

@@ -50,7 +50,7 @@ from crisalad_jax.utils.target import PORTABLE, STRAIGHT, jax_setting, lowering_
 PROGRAM, WEIGHTS = "describe.jax_export", "weights.safetensors"
 FORMATS = ("stablehlo", *engines.FORMATS)
 TOLERANCE = 1e-5
-"""Largest difference between an exported program's descriptors and `describe`'s, of length 1."""
+"""Largest difference of a program's descriptor values from those of `describe`, at unit length."""
 GROUPINGS = {
     "single": "every image is described independently",
     "batch": "the images of a call attend to each other",
@@ -76,8 +76,8 @@ class ExportConfig:
     """
 
     grouping: Literal["single", "batch", "any"] = "single"
-    """How a call's images attend to each other: "single", not at all; "batch", all to all; "any",
-    by a mask, in two programs of ONNX or OpenVINO: images to tokens, and these to descriptors."""
+    """How images of a call attend to each other: "single", not at all; "batch", all to all; "any",
+    as a mask allows, in two ONNX or OpenVINO programs: images to tokens, tokens to descriptors."""
     batch_size: int | None = None
     """Number of images in a call; None allows any number (a symbolic dimension)."""
     weights_inside: bool = False
@@ -85,10 +85,10 @@ class ExportConfig:
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
     """Platforms of StableHLO; the other formats run wherever their engines do."""
     format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
-    """StableHLO, which JAX runs; ONNX, which most engines read; or OpenVINO's own."""
+    """StableHLO, which JAX runs; ONNX, which most engines read; or OpenVINO's own format."""
     pixels: Literal["bytes", "floats"] | None = None
-    """8-bit pixels, which the program normalises, or normalised floats; None takes the type that
-    the model resizes."""
+    """8-bit pixels, which the program normalises, or normalised floats; None is the type that the
+    model resizes."""
     for_colmap: bool = False
     """Whether an ONNX program has the inputs and outputs of COLMAP's draft of global-descriptor
     retrieval: normalised floats (batch, 3, height, width) to `descriptor`."""
@@ -120,9 +120,9 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
 
     Raises:
         InputError: parameters of another configuration; 2 GiB or more of weights inside; optimal
-            transport that must converge; float inputs with local-contrast normalisation;
-            normalisation other than ImageNet's for COLMAP; or products other than float32 in a
-            format other than StableHLO.
+            transport that raises unless converged; float inputs with local-contrast normalisation;
+            normalisation other than ImageNet's for COLMAP; or a compute type other than float32 in
+            a format other than StableHLO.
     """
     check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
@@ -239,8 +239,8 @@ def write_export(
         out: the folder.
         model: parameters and configuration.
         how: format, platforms, batch size and grouping.
-        calibration: prepared images with which onnxruntime quantises products to int8, for ONNX and
-            OpenVINO. The manifest says how much descriptors then differ. None leaves float32.
+        calibration: prepared images from which onnxruntime calibrates int8 products, for ONNX and
+            OpenVINO. The manifest records how far descriptors then differ. None is float32.
 
     Returns:
         The content of manifest.json.
@@ -266,7 +266,7 @@ def write_export(
     is_one_program = how.grouping != "any" and how.batch_size is None and not how.weights_inside
     if calibration is not None and (how.format == "stablehlo" or not is_one_program):
         raise InputError(
-            "int8: found with format stablehlo, grouping any, weights inside or a batch size, "
+            "int8: found format stablehlo, grouping any, weights inside or a batch size, "
             "expected a program of onnx or openvino for any number of images"
         )
     if config.preprocessing.size_rule != "fixed":
@@ -426,7 +426,7 @@ def _difference(
 
 
 def _images(config: ModelConfig, how: ExportConfig) -> dict[str, Any]:
-    """Describe how to prepare images for the program, which has one size, whatever the rule."""
+    """Describe how to prepare images for the program, which takes one size, whatever the rule."""
     chain, size = config.preprocessing, config.input_size
     fixed = dataclasses.replace(chain, size_rule="fixed", round_to_patch=False)
     values = {

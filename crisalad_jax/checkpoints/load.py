@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from crisalad_jax.nn.model import Model
 
 HUB_FILE = "model.safetensors"
-"""Name of the weights in a repository at the hub, or in a folder for it."""
+"""Name of the weight file in a repository at Hugging Face's hub, or in a folder for one."""
 
 
 @takes(path=PATH)
@@ -65,13 +65,13 @@ def find_weights(
 
     None is the small model in this package, "starter", with a warning. Other names are "hog" and
     "thumbnail", baselines that learn nothing. A published model is downloaded the first time. Its
-    licence is shown each time, or once if it forbids commercial use, because its file says so too.
+    licence is shown each time, but only once if it forbids commercial use: its file repeats it.
     A file of such a name in the working directory takes precedence, with a warning.
 
     Args:
         weights: a path, a name from `crisalad models`, or None; or hf://OWNER/NAME for a file at
             Hugging Face's hub; or a folder with the layout of one at the hub.
-        engine: any but "jax" also accepts the folder of an exported model, "auto" if it is one.
+        engine: any but "jax" also accepts a folder; "auto" only that of an exported model.
         quiet: whether to hide the progress bar.
 
     Returns:
@@ -114,7 +114,7 @@ def find_weights(
     model = PUBLISHED.get(name)
     if os.path.isfile(path):
         if model is not None or name in starter.FILES:
-            warn(f"{name}: found a file of this name here, and took that, not the model so named")
+            warn(f"{name}: found a file of this name here, and took that instead of the model")
         return path
     if name in starter.FILES:
         return starter.FILES[name]

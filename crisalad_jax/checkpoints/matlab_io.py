@@ -1,6 +1,6 @@
 """Read NetVLAD as its authors published it, in a MATLAB file, the way hloc does.
 
-scipy reads it, and runs no code of the file. Axes of length 1 are dropped, as in hloc's reader.
+scipy reads it without running any code in it. Axes of length 1 are dropped, as in hloc's reader.
 Names and axes of the result are those of hloc's own module.
 """
 

@@ -75,7 +75,7 @@ class _Declared:
 def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
     """Read a public checkpoint, or a file of this package; half precision becomes float32 exactly.
 
-    Torch files are read with `torch.load(weights_only=True)`, which runs no code of the file.
+    Torch files are read with `torch.load(weights_only=True)`, which runs no code in the file.
 
     Raises:
         InputError: the file is missing, truncated, of none of the formats, asks to run code, or
@@ -88,7 +88,7 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
         start = file.read(512)
     if is_html(start):
         raise InputError(f"{path}: found a page of HTML, expected a checkpoint")
-    # Torch files are zip archives, older ones pickles. safetensors begin with a length and a brace.
+    # Torch files are zip archives, older ones pickles. Safetensors begin with a length and a brace.
     if path.suffix == MATLAB_SUFFIX:
         content = read_matlab(path)
     elif start[8:9] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
@@ -196,7 +196,7 @@ def write_checkpoint(
     are stored in the metadata of the state, which other programs ignore.
 
     Raises:
-        InputError: the format cannot hold this model, or the file cannot be made.
+        InputError: the format cannot hold this model, or the file cannot be written.
         ModuleNotFoundError: torch is needed but not installed.
     """
     path = pathlib.Path(path)
@@ -249,7 +249,7 @@ def convert(
             see `save_weights`.
 
     Returns:
-        What was read and written.
+        The formats of source and target, and the model's configuration.
 
     Raises:
         InputError: what `read_checkpoint` and `write_checkpoint` raise, or the target or format
@@ -297,7 +297,7 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     If a ResNet has more stages, the first ones are used.
 
     Args:
-        path: a file or name that `load` reads.
+        path: a file that `read_checkpoint` reads.
         config: configuration of the model's backbone.
         fresh: parameters of such a backbone, whose adapters are used if the file has none.
 
@@ -326,7 +326,7 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     # Ignore non-semantic fields, such as the initialisation: weights do not depend on them.
     wrong = differences(with_non_semantic_fields_of(config, theirs), config, "backbone")
     if wrong:
-        raise InputError(f"{path}: this backbone is another than the model's: {'; '.join(wrong)}")
+        raise InputError(f"{path}: this backbone differs from the model's: {'; '.join(wrong)}")
     return params
 
 

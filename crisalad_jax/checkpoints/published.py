@@ -25,7 +25,7 @@ class Licence:
     commercial: bool | None = None
     """Whether it allows commercial use; None if the repository does not say."""
     terms: str = ""
-    """What else a user must know about it, in words."""
+    """What else a user must know about it."""
 
     def __post_init__(self) -> None:
         """Check the types."""
@@ -53,14 +53,14 @@ class Published:
     parameters: int
     """Number of parameters, as `crisalad info` counts them."""
     images: str
-    """How images are resized, in the words of its format's configuration."""
+    """How images are resized, as the configuration of its format describes it."""
     licence: Licence
     repository: str
     """Address of the page that publishes the file."""
     file: str
     """Name of the file, also at a mirror."""
     url: str | None
-    """Address of the file; None if it has none of its own, as in a folder or an archive."""
+    """Address of the file; None if it has no separate one, as in a folder or an archive."""
     paper: str
     """Authors, venue and year."""
     backbone: str = ""
@@ -75,7 +75,7 @@ class Published:
 
     @property
     def notice(self) -> str:
-        """The licence in words, and the repository it applies to."""
+        """The licence, and the repository that it applies to."""
         return f"{self.licence.words} ({self.repository})"
 
     @property
@@ -139,8 +139,8 @@ def register_published(text: str) -> None:
     for model in models:
         if model.format not in own | FORMATS.keys():
             raise InputError(
-                f"{source}: {model.name}: found format {model.format!r}, expected one of its own "
-                f"or of {', '.join(FORMATS)}"
+                f"{source}: {model.name}: found format {model.format!r}, expected one that the "
+                f"text defines, or {', '.join(FORMATS)}"
             )
     add_formats(facts, source)
     _LICENCES.update(licences)

@@ -50,7 +50,7 @@ FORMAT = "crisalad-jax export 1"
 MANIFEST = "manifest.json"
 _EXPECTED = "the manifest of `crisalad export`"
 DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
-"""Names of programs: images to descriptors, or the two halves of that."""
+"""Names of programs: images to descriptors, images to tokens, and tokens to descriptors."""
 
 
 @brief
@@ -58,7 +58,7 @@ DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
 class Runtime:
     """A model in an engine, used in place of its parameters.
 
-    Its descriptors are those of `describe` for images of one size.
+    It computes the descriptors of `describe`, for images of one size.
     """
 
     folder: pathlib.Path
@@ -81,19 +81,19 @@ class Runtime:
     preparation: Preparation
     """How photographs are prepared."""
     model: Mapping[str, Any]
-    """The configuration, at the size and in the type that this engine computes, as JSON values."""
+    """The configuration, with the image size and compute type of this engine, as JSON values."""
     _first: Program
     _second: Program | None
     row_dtype = "float32"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the bytes of its files, so that another machine can open it."""
+        """Pickle the bytes of the exported files, so that another machine can open the model."""
         files = {path.name: path.read_bytes() for path in self.folder.iterdir() if path.is_file()}
         return _opened, (files, self.engine, self.model)
 
     @functools.cached_property
     def config(self) -> "ModelConfig":
-        """The model's configuration, at the size and in the type that this engine computes."""
+        """The model's configuration, with the image size and compute type of this engine."""
         from crisalad_jax.nn.config import ModelConfig
 
         return from_plain(ModelConfig, self.model, source=str(self.folder))
@@ -157,7 +157,7 @@ class Runtime:
 
         Args:
             rows: rows from `tokens`, (group, image, number).
-            mask: `mask[g, i, j]` allows image i of group g to attend to image j of it.
+            mask: `mask[g, i, j]` allows image i of group g to attend to image j.
 
         Returns:
             Descriptors (group, image, dim).
@@ -251,10 +251,10 @@ def fastest_engine(
 ) -> EngineName | Literal["jax"]:
     """Choose the fastest engine for single images, among those that compute what JAX does.
 
-    ONNX Runtime comes before OpenVINO, which starts later and is then as fast
+    ONNX Runtime comes before OpenVINO, which is as fast but takes longer to start
     (docs/performance.md). The engine must be installed. The first time, the model is exported for
     it, and the export compares descriptors with JAX's. JAX is chosen if it may have an accelerator,
-    for bfloat16, for images that keep their own sizes, with plug-ins, and if no engine can be used.
+    for bfloat16, for images without a fixed size, with plug-ins, and if no engine can be used.
 
     Args:
         source: a weight file, or an exported folder.
@@ -362,7 +362,7 @@ def _load(
     entries = [part[name] for part in parts for name in ("program", "weights") if part[name]]
     for entry in entries:
         if os.path.basename(entry["file"]) != entry["file"]:
-            raise InputError(f"{folder}: found file {entry['file']!r}, expected a name in it")
+            raise InputError(f"{folder}: found file {entry['file']!r}, expected a bare file name")
     files = {folder / entry["file"]: entry["sha256"] for entry in entries}
     with concurrent.futures.ThreadPoolExecutor() as pool:
         digests = pool.map(sha256_of, files if verify else ())
@@ -427,7 +427,7 @@ def _export(
 
     config = from_plain(ModelConfig, model, source=str(weights))
     check_takes_photographs(config, weights)
-    warn(f"{weights}: exporting it for {engine}, once (--runtime jax needs none); into {folder}")
+    warn(f"{weights}: exporting once for {engine}, into {folder} (--runtime jax needs no export)")
     write_export(folder, load_weights(weights)._replace(config=config), ExportConfig(**how))
 
 
@@ -440,7 +440,7 @@ def check_takes_photographs(config: "ModelConfig", source: object) -> None:
     if config.backbone.local_features is not None:
         raise NotExportableError(
             f"{source}: found backbone {config.backbone.part_name}, whose features no engine "
-            "finds, expected --runtime jax"
+            "computes, expected --runtime jax"
         )
 
 

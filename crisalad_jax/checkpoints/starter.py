@@ -21,13 +21,13 @@ BEST = "megaloc"
 
 
 def named(weights: str | os.PathLike[str]) -> str:
-    """Return what to call a weight file in output: its path, or the name of one of these."""
+    """Return what to call a weight file in output: its path, or the name of a model here."""
     names = (name for name, file in FILES.items() if file == pathlib.Path(weights))
     return next(names, os.fspath(weights))
 
 
 def recorded(weights: str | os.PathLike[str]) -> str:
-    """Return where a map's weights are, as the map records it: a path, or the name of one of these.
+    """Return what a map records as its weights: a path, or the name of a model in this package.
 
     A map may be moved to another machine, where the package is at another path.
     """

@@ -47,7 +47,7 @@ class Content(NamedTuple):
 class _Numpy:
     """A stand-in for a NumPy array stored with the weights, for its type, or for a scalar.
 
-    Torch rejects any file with one, such as the recalls of a training run, and NumPy's own
+    Torch rejects any file with one, as for the recalls of a training run, and NumPy's own
     constructors would run on unchecked bytes. `array` checks the content before it makes the array.
     """
 
@@ -87,7 +87,7 @@ _NUMPY = (
 def _stand_in(name: str) -> type:
     """Make a stand-in, a dictionary, for any other class or function that a file names.
 
-    Making it runs no code of the file. Torch fills exactly this kind of dictionary with items, as
+    Making it runs no code in the file. Torch fills exactly this kind of dictionary with items, as
     for a `defaultdict`, and with attributes, as for an `argparse.Namespace`.
     """
 
@@ -280,12 +280,12 @@ def write_torch(
     Args:
         path: the file.
         state: arrays by name.
-        under: key of the file's dictionary that holds the state; empty: the file is the state.
+        under: key of the file's dictionary that holds the state; empty if the file is the state.
         bare: whether the file is just the one tensor.
         declared: see `Content`.
 
     Raises:
-        InputError: the file cannot be made.
+        InputError: the file cannot be written.
         ModuleNotFoundError: torch is not installed.
     """
     import torch

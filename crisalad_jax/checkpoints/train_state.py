@@ -88,7 +88,7 @@ class StateStore:
         self._clear()
 
     def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
-        """Write the arrays of `state` and the JSON values of `record`, replacing that step's.
+        """Write the arrays of `state` and the JSON values of `record`, replacing a state of `step`.
 
         It copies the arrays before it returns, and writes the copies in the background.
 
@@ -200,8 +200,8 @@ def _words(error: Exception) -> str:
 def _hashes(folder: pathlib.Path) -> dict[str, str]:
     """Compute the SHA-256 of all files of a state's arrays and record.
 
-    The files next to these folders are orbax's bookkeeping: it changes them later, and no loaded
-    value depends on them.
+    Files at the top level are orbax's bookkeeping: it changes them later, and no loaded value
+    depends on them.
     """
     files = (path for path in folder.glob("*/**/*") if path.is_file())
     return {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}

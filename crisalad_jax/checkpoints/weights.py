@@ -154,7 +154,7 @@ def load_weights(
     Args:
         path: the file; `find_weights` finds the file of a name.
         expected: if given, the configuration that the file must have, except for what parameters
-            do not depend on: image size (but MixVPR's do), dropout, compute type, remat.
+            do not depend on: image size (except for MixVPR), dropout, compute type, remat.
         verify: whether to check the file against its checksum.
 
     Returns:
@@ -222,7 +222,7 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
 def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None:
     """Check that a configuration is plausible for some arrays.
 
-    This comes before anything is made from it: a file may claim any sizes.
+    This runs before anything is made from the configuration: a file may claim any sizes.
 
     Args:
         plain: the configuration, as JSON values.
@@ -230,15 +230,15 @@ def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None
         source: the file, for messages.
 
     Raises:
-        InputError: the configuration has many more layers, or far larger ones.
+        InputError: the configuration has more layers than arrays, or far larger sizes.
     """
     text = json.dumps(plain)
     layers = sum(map(int, re.findall(r'"layers": (\d+)', text)))
     largest = max(map(int, re.findall(r": (\d+)[,}]", text)), default=0)
     if layers > len(arrays) or largest > max(2**20, sum(array.size for array in arrays)):
         raise InputError(
-            f"{source}: found {len(arrays)} arrays, far from the sizes that its configuration "
-            f"says: {layers} layers, and up to {largest}"
+            f"{source}: found {len(arrays)} arrays, far from the sizes in its configuration: "
+            f"{layers} layers, and sizes of up to {largest}"
         )
 
 

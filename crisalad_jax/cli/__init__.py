@@ -34,8 +34,8 @@ _COMMANDS: dict[str, dict[str, str]] = tomllib.loads(
 """Help of each command, from commands.toml.
 
 Each command is a module here, whose function `run` takes the parsed flags, and may return what
---json writes or prints. It may also have `needs_jax(flags)`; if that is false, and JAX computes
-after all, the command calls `common.Jax.set_up`.
+--json writes or prints. It may also have `needs_jax(flags)`; if that returns false, a command that
+uses JAX after all calls `common.Jax.set_up` first.
 """
 
 
@@ -136,8 +136,8 @@ def _numbers(flag: str, value: Any) -> Iterator[tuple[str, int]]:
 def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False) -> int:
     """Run one command, and return its exit code.
 
-    A dedicated process may `keep_programs` (`utils.executable_cache`), because nothing else changes
-    the code there.
+    Set `keep_programs`, which caches compiled programs (`utils.executable_cache`), only in a
+    dedicated process, where nothing else changes the code.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given[:1] == ["help"]:  # as in git
@@ -172,7 +172,7 @@ def _exit_code(given: list[str], keep_programs: bool) -> int:
 
 
 def _check_command(name: str) -> None:
-    """Raise InputError if there is no such command, with those of a similar name, or else all."""
+    """Raise InputError for an unknown command, and suggest similar names or list all commands."""
     near = difflib.get_close_matches(name, _COMMANDS)
     words = f"did you mean {' or '.join(near)}?" if near else f"expected {', '.join(_COMMANDS)}"
     require(name in _COMMANDS, f"found no command {name!r}; {words} (see crisalad --help)")
@@ -187,7 +187,7 @@ _WORDS_OF_MEMORY = (
 
 
 def _reason(error: BaseException, name: str) -> str | None:
-    """Describe in one line an error of a command whose cause is known; None for others."""
+    """Describe an error of known cause in one line; return None for others."""
     if isinstance(error, ModuleNotFoundError):
         return missing_extra(error, f"crisalad {name}")
     if isinstance(error, InputError | OSError):  # OSError: a full disk, or what no check foresaw

@@ -11,14 +11,14 @@ class Ablate(ComparisonFlags):
     """Train CriSALAD with one part changed at a time; show what adapters cost (Tables 2 and 3)."""
 
     rows: str | None = None
-    """Comma-separated; by default all of the paper: crisalad, lr-1e-4, step, multi-resolution, mlp,
+    """Comma-separated; by default the paper's: crisalad, lr-1e-4, step, multi-resolution, mlp,
     no-adapter, no-encoder, no-encoder-step. Any registered part is a row too, as NAME or KIND:NAME:
     CriSALAD with that part. With --row the default is only crisalad."""
     row: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A custom row, as "NAME: flag=value, flag=value" with any flags of `train` that set the model,
-    loss, optimiser, augmentation or training, and recipe=NAME for another start than crisalad. Give
-    --row again for each row. Separate a flag's numbers by spaces (image-size=224 224), and quote a
-    value with a comma."""
+    loss, optimiser, augmentation or training, and recipe=NAME to start from a recipe other than
+    crisalad. Repeat --row for each row. Separate a flag's numbers by spaces (image-size=224 224),
+    and quote a value with a comma."""
 
 
 def run(arguments: Ablate) -> dict[str, Any]:

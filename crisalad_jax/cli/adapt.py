@@ -23,8 +23,8 @@ class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     weights: pathlib.Path | None = None
     """Weights that made the map, if they were moved since."""
     images: tuple[pathlib.Path, ...] = ()
-    """More images of the place to train on, such as those of another day; they don't join the
-    map."""
+    """More images of the place to train on, such as those of another day; they aren't added to
+    the map."""
     place_radius: float | None = None
     """Radius in metres around a place's centre, for a map with positions; by default 10."""
     place_frames: int | None = None
@@ -49,7 +49,7 @@ def command(arguments: Sequence[str]) -> type:
 
 
 def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
-    """Return the configuration that flags start from, of the map's model."""
+    """Return the configuration that flags start from, and the preset that sizes its parts."""
     folder = find_flag(arguments, "--map")
     if folder is None or not pathlib.Path(folder).exists():
         return recipe("b14", "adapt"), "b14"

@@ -15,18 +15,18 @@ from crisalad_jax.retrieval.verification.verify import Verify
 
 
 class Calibrate(ReadFlags, SetFlags, MapFlags, TableFlags):
-    """Measure the similarity from which a map's answers are correct, and store it in the map.
+    """Measure the similarity above which a map's answers are correct, and store it in the map.
 
     Every image is described independently, at the map's size, by the map's model. The set's
-    database should be the map's places, or about as many like them, and its queries like those that
-    the map will get, including unknown places. `crisalad query` then answers "unknown" to images
-    below that similarity. An earlier calibration is replaced.
+    database should show the map's places, or about as many similar ones, and its queries should be
+    like those that the map will get, including unknown places. `crisalad query` then answers
+    "unknown" to images below that similarity. An earlier calibration is replaced.
     """
 
     precision: float = 0.99
     """Share of the answers that must be correct."""
     verify: int | None = None
-    """Verify this many answers, and measure how many inliers the best needs, not which similarity
+    """Verify this many answers, and measure the inliers, not the similarity, that the best needs
     (docs/verification.md); stored separately, for `crisalad query --verify`."""
     matcher: pathlib.Path | None = None
     """ONNX file of the matcher that verifies; by default SIFT."""

@@ -50,7 +50,7 @@ def echo(line: str) -> None:
 def show(table: rich.table.Table) -> None:
     """Print a table without wrapping; a wide one in parts, each with the first column.
 
-    The terminal still breaks the lines of a column that is wider than itself.
+    The terminal still wraps a column that is wider than itself.
     """
     if table.title:
         echo(str(table.title))
@@ -85,7 +85,7 @@ def _part(
 
 
 STDOUT = pathlib.Path("-")
-"""Name of the standard output, in place of a file of JSON or LaTeX."""
+"""Path that means standard output, for --json and --latex."""
 
 
 def prepare_output(flags: Any) -> None:
@@ -94,8 +94,8 @@ def prepare_output(flags: Any) -> None:
     If --json or --latex is `STDOUT`, print everything else on stderr.
 
     Raises:
-        InputError: a file or folder cannot be made, its suffix is of another format, or both of
-            these flags are to be printed.
+        InputError: a file or folder cannot be made, its suffix is of another format, or both
+            flags are `STDOUT`.
     """
     printed = [name for name in ("json", "latex") if getattr(flags, name, None) == STDOUT]
     require(len(printed) < 2, "--latex: found - with --json -, expected only one of the two")
@@ -111,14 +111,14 @@ def prepare_output(flags: Any) -> None:
 
 
 class Jax:
-    """The set-up of a command before JAX computes."""
+    """JAX's set-up for a command."""
 
     keeps_programs: ClassVar[bool] = False
     """Whether compiled programs are stored; see `executable_cache.cache_executables`."""
 
     @classmethod
     def set_up(cls) -> None:
-        """Set up devices and caches, as `compiler.set_up` says."""
+        """Set up devices and caches, as `compiler.set_up` does."""
         from crisalad_jax.utils import compiler, executable_cache
 
         compiler.configure()
@@ -159,7 +159,7 @@ def emit_latex(file: pathlib.Path | None, *tables: Table) -> None:
 
 
 def first_of(names: Sequence[str]) -> str:
-    """Quote the first of some names, for a message that has their number."""
+    """Quote the first of some names, for a message that states their number."""
     return f"{names[0]!r} the first" if names else ""
 
 
@@ -175,7 +175,7 @@ def refuse_with(flag: str, **others: Any) -> None:
 
 
 def refuse_without(flag: str, value: Any, **others: Any) -> None:
-    """Raise InputError if one of the other flags has a value, but not `flag`, which it needs.
+    """Raise InputError if one of the other flags, which need `flag`, has a value without it.
 
     Args:
         flag: its name.
@@ -187,7 +187,7 @@ def refuse_without(flag: str, value: Any, **others: Any) -> None:
 
 
 def _given(flags: Mapping[str, Any]) -> list[str]:
-    """List the flags that have a value; 0 is one."""
+    """List the flags that have a value, 0 included."""
     return [
         f"--{name.replace('_', '-')}"
         for name, value in flags.items()
@@ -218,7 +218,7 @@ def find_given(
 
 
 def given_positions(flags: PositionFlags) -> "Track | pathlib.Path | None":
-    """Return the positions that flags give, as the library takes them.
+    """Return the positions that flags give, in the form that the library takes.
 
     Raises:
         InputError: a time without positions; or what `read_track` raises.
@@ -250,7 +250,7 @@ def open_set(flags: Any) -> "Benchmark":
 
 
 def load_model(weights: pathlib.Path, flags: SizeFlags, *, quiet: bool = False) -> "Model":
-    """Load a JAX model by its file or name, changed by flags.
+    """Load a JAX model by its file or name, and apply flags to it.
 
     Raises:
         InputError: what `load_weights` and `ModelConfig.resized` raise.

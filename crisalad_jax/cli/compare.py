@@ -10,33 +10,33 @@ from crisalad_jax.cli.flags import FOLDER, ClusterFlag, ReadFlags, SizeFlags, Ta
 
 
 class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
-    """The flags of both commands."""
+    """Flags that `compare` and `ablate` share."""
 
     test: tuple[pathlib.Path, ...]
     """Evaluation sets, each in any layout that `evaluate` reads."""
     out: Annotated[pathlib.Path, FOLDER]
-    """Folder of the comparison; the same command resumes what is in it. It also gets table.md,
-    table.csv, results.json, and the page index.html."""
+    """Folder of the comparison; the same command resumes it. Results are in table.md, table.csv,
+    results.json and the page index.html."""
     train: pathlib.Path | None = None
     """Training set: a folder with one folder per place, a table name,place[,lat,lon[,heading]]
     (places.csv in the folder, or the file), or Dataframes/ and Images/ of GSV-Cities."""
     backbone: pathlib.Path | None = None
     """Train from this backbone, as the recipes say: a file of this package, a public checkpoint, or
-    a published model's name. None trains all from scratch, by the recipe scratch."""
+    a published model's name. None trains from scratch, by the recipe scratch."""
     preset: str = "b14"
-    """tiny, s14, b14, l14 or g14."""
+    """Model size: tiny, s14, b14, l14 or g14."""
     seeds: int = 3
     """Runs of each method, with seeds 0, 1 and so on."""
     epochs: int | None = None
-    """Epochs; by default the recipes', from scratch 6."""
+    """Epochs; by default as the recipes say, or 6 from scratch."""
     grouping: str = "single"
-    """Comma-separated, as `evaluate` takes them, for methods with a cross-image encoder."""
+    """Groupings for methods with a cross-image encoder, comma-separated as in `evaluate`."""
     reference: str | None = None
     """Row that differences, speeds and training times are relative to; by default crisalad, or the
     first if that is not compared."""
     jobs: int | None = None
     """Parallel runs, each a Ray task (extra ray) with its share of the devices; without --cluster
-    on this machine. By default 1; on a cluster one per GPU, or per node if there is none."""
+    on this machine. By default 1; on a cluster one per GPU, or per node without GPUs."""
 
 
 def names_of(text: str) -> tuple[str, ...]:
@@ -53,7 +53,7 @@ def run_comparison(
     """Run a comparison, and print its tables.
 
     Args:
-        flags: the flags of both commands.
+        flags: the flags that both commands share.
         command: "compare" or "ablate".
         names: what is compared.
         **more: settings of the `ComparisonConfig` that only one command has.
@@ -93,15 +93,15 @@ class Compare(ComparisonFlags):
     """Train or load the paper's Table 1 methods, evaluate them the same way, and print tables."""
 
     methods: str | None = None
-    """Comma-separated. By default the models of --weights; if there are none, or if they replace
-    methods, those of Table 1 over one backbone: crisalad+netvlad (or gem, conv-ap, patch-netvlad,
+    """Comma-separated. By default the models of --weights; without them, or if each is named as a
+    method, those of Table 1 over one backbone: crisalad+netvlad (or gem, conv-ap, patch-netvlad,
     transvpr, mixvpr: that head with CriSALAD's backbone and training), cosplace-vit,
     eigenplaces-vit, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is a method too,
     and so is RECIPE+PART, with a registered part as NAME or KIND:NAME."""
     weights: tuple[str, ...] = ()
     """NAME=FILE or the NAME of a published model (`crisalad models`). If NAME is a method, it uses
-    these weights and is not trained. Any other name is a row of its own, whatever model the file
-    holds; + and a second stage after it, as in fol-large+fol, re-ranks the first retrievals."""
+    these weights and is not trained. Any other name adds a row; with + and a second stage, as in
+    fol-large+fol, the model's first retrievals are re-ranked."""
     rerank: int = 20
     """Number of retrievals that a second stage re-ranks."""
 

@@ -19,7 +19,7 @@ class Completion(Flags):
     """Print a script that lets a shell complete commands, flags and choices."""
 
     shell: Annotated[tyro.conf.Positional[Shell], tyro.conf.arg(metavar="{bash,zsh,fish}")]
-    """The shell that reads it (docs/command-line.md)."""
+    """Shell that will read the script (docs/command-line.md)."""
 
 
 def run(arguments: Completion) -> None:
@@ -28,9 +28,9 @@ def run(arguments: Completion) -> None:
 
 
 def completion_script(shell: Shell) -> str:
-    """Write the script, which starts no Python: it contains everything that it completes.
+    """Write the script, which contains all completions, so that completing starts no Python.
 
-    For a configuration it knows the flags of the default parts. If the extra of a command is not
+    Configuration flags are those of the default parts. If the extra of a command is not
     installed, only the command's name is completed.
     """
     import shtab
@@ -54,7 +54,7 @@ def completion_script(shell: Shell) -> str:
 
 
 def _parser(name: str) -> argparse.ArgumentParser:
-    """Make a command's parser, with the choices that its flags take by name."""
+    """Make a command's parser, with names of presets, recipes and models as choices."""
     from crisalad_jax.nn.config import PRESETS
     from crisalad_jax.training.recipes import RECIPES
 
@@ -71,7 +71,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
 
 
 def _models_and_files() -> dict[str, Any]:
-    """Return how each shell completes weights: by the names of models, and by files."""
+    """Return how each shell completes weights: by model names and files."""
     names = " ".join((starter.NAME, *PUBLISHED))
     function = "_crisalad_models_and_files"  # shtab's bash looks for _file in it
     return {

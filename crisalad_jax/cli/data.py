@@ -33,7 +33,7 @@ class Data(TableFlags, QuietFlag):
     to: Annotated[pathlib.Path | None, NEW_FOLDER] = None
     """With fetch: new folder for the set, which `crisalad evaluate --data` then reads."""
     set: str | None = None
-    """With check: name of the expected set; by default what the folder is named after, or any."""
+    """With check: name of the expected set; by default the one in the folder's name, or any."""
     read: bool = True
     """With check: decode all images; --no-read only counts them."""
 
@@ -62,12 +62,12 @@ def _list(arguments: Data) -> dict[str, Any]:
         _show_facts(published, "DIR")
         return facts
     show_tables(sets_table(tuple(SETS.values())), latex=arguments.latex)
-    echo("crisalad data list NAME prints all of one; crisalad data fetch NAME --to DIR gets it")
+    echo("crisalad data list NAME prints all about one; crisalad data fetch NAME --to DIR gets it")
     return {"sets": [dataclasses.asdict(each) for each in SETS.values()]}
 
 
 def _show_facts(published: PublishedSet, folder: str) -> None:
-    """Print what is known about a set, and the steps by hand."""
+    """Print what is known about a set, and the steps to get it."""
     facts = {
         "set": published.title,
         "page": published.page,
@@ -98,12 +98,12 @@ def _fetch(published: PublishedSet, arguments: Data) -> dict[str, Any]:
     else:
         _show_facts(published, folder)
     to = fetch_set(published.name, folder, quiet=arguments.quiet)
-    echo(f"{to}: whole; {published.command.replace('DIR', folder)}")
+    echo(f"{to}: complete; {published.command.replace('DIR', folder)}")
     return _check(to, published.name, dataclasses.replace(arguments, read=False))
 
 
 def _check(folder: pathlib.Path, expected: str | None, arguments: Data) -> dict[str, Any]:
-    """Print which set a folder is.
+    """Print which set a folder contains.
 
     Raises:
         InputError: it is not as published, or not complete.

@@ -47,7 +47,7 @@ class Distil(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
-    """Find the weights of --student, whose model determines the flags, and pass their file.
+    """Find the weights of --student, whose model determines the flags, and pass on their file.
 
     Raises:
         InputError: what `find_weights` and `read_model` raise.
@@ -72,7 +72,7 @@ def command(arguments: Sequence[str]) -> type:
 
 
 def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
-    """Return the configuration that flags start from, and the preset that parts are sized by."""
+    """Return the configuration that flags start from, and the preset that sizes its parts."""
     student = find_flag(arguments, "--student") or "b14"
     preset = student if student in PRESETS else "b14"
     model = read_model(student) if os.path.isfile(student) else None

@@ -46,7 +46,7 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     dtype: Literal["float32", "bits"] = "float32"
-    """How descriptors are compared: bits are their signs, by the Hamming distance
+    """How descriptors are compared: bits compares their signs by the Hamming distance
     (docs/maps.md)."""
     rerank: str | None = None
     """NAME:TOPK re-ranks the first TOPK retrievals by local features: patch-netvlad,
@@ -63,12 +63,11 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     seed: int = 0
     """Seed of the first shuffled order and untrained weights."""
     seeds: int = 3
-    """Shuffled orders, whose mean and standard deviation are shown."""
+    """Number of shuffled orders, whose mean and standard deviation are shown."""
     out: Annotated[pathlib.Path | None, FOLDER] = None
     """Folder for a gallery of retrievals and the resolved configuration."""
     report: Annotated[pathlib.Path | None, FOLDER] = None
-    """Folder for a page of all results, index.html, that needs no other file and no network; and
-    its pictures."""
+    """Folder for a self-contained page of all results, index.html, and its pictures as files."""
     rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
     """Recording for the viewer Rerun: queries, retrievals, similarities; correct ones in green."""
 
@@ -141,7 +140,7 @@ def run(arguments: Evaluate) -> None:
 
 
 def _check_flags(arguments: Evaluate) -> None:
-    """Check before any work that flags fit together."""
+    """Check that flags fit together, before any work."""
     if arguments.weights is not None:
         refuse_with("--weights", preset=arguments.preset)
     if arguments.runtime != "jax":

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Export(ComputeFlags, PluginFlag, JsonFlag):
-    """Write a model as a program that runs without this package: StableHLO, ONNX or OpenVINO's."""
+    """Write a model as a program that runs without this package: StableHLO, ONNX or OpenVINO."""
 
     weights: pathlib.Path
     """A .safetensors file of this package, or a published model's name (`crisalad models`)."""
@@ -24,22 +24,21 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
     """stablehlo, for JAX; onnx, for onnxruntime, TensorRT and others; or openvino. The last two are
     run once, and compared with this package (docs/export.md)."""
     batch_size: int | Literal["symbolic"] = "symbolic"
-    """Images in a call, or symbolic: any number."""
+    """Images per call, or symbolic for any number."""
     grouping: Literal["single", "batch", "any"] = "single"
-    """Every image described independently, or the images of a call attending to each other; any is
-    two programs of onnx or openvino, and a mask says which image attends to which."""
+    """single describes every image independently, batch lets a call's images attend to each other;
+    any writes two programs of onnx or openvino, and a mask says which images attend to which."""
     weights_inside: bool = False
     """Store the weights as constants in the program, not in a file next to it."""
     pixels: Literal["bytes", "floats"] | None = None
     """Bytes, which the program normalises, or normalised floats; by default what the model
     resizes."""
     for_colmap: bool = False
-    """For onnx: inputs and outputs that COLMAP's draft of retrieval by global descriptors reads
+    """For onnx: the inputs and outputs of COLMAP's draft of retrieval by global descriptors
     (docs/export.md)."""
     int8: pathlib.Path | None = None
-    """For onnx or openvino: photographs to quantise products with, a folder or other source of a
-    few dozen like those to be described (one a second of a video). Costs recall
-    (docs/export.md)."""
+    """For onnx or openvino: photographs for quantising matrix products, a folder or other source of
+    a few dozen typical ones (one per second of a video). Costs recall (docs/export.md)."""
     platforms: str | None = None
     """For stablehlo, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
 
@@ -72,7 +71,7 @@ def run(arguments: Export) -> dict[str, Any]:
             f"{how.format}, {manifest['products']}; {checked['engine']} differs by at most "
             f"{checked['largest_difference']:.1g} from this package"
         )
-    inside = "inside" if how.weights_inside else "beside"
+    inside = "inside" if how.weights_inside else "in a separate file"
     echo(
         f"{arguments.out}: images {' -> descriptors '.join(shapes)}; "
         f"{manifest['grouping_means']}; weights {inside}; {last}"
@@ -85,7 +84,7 @@ _MOST = 256
 
 
 def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray":
-    """Read some photographs, evenly spread over all, as the model takes them."""
+    """Read some photographs, evenly spread over all, and prepare them for the model."""
     import numpy as np
 
     from crisalad_jax.data.images import read_pixels

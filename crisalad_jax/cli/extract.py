@@ -32,7 +32,7 @@ class Extract(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFl
     seed: int = 0
     """Seed of the shuffled order."""
     root: pathlib.Path | None = None
-    """Folder that names are relative to, by default --images: hloc's folder of all images."""
+    """Folder that names are relative to, by default --images; for hloc its folder of all images."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
 
@@ -50,7 +50,7 @@ def run(arguments: Extract) -> dict[str, Any]:
     skipped = f"; {len(result.skipped)} unreadable images left out" if result.skipped else ""
     length, images = result.descriptors.shape[1], model.config.images_in_words
     echo(
-        f"{out}: {described} of {length} numbers, grouping {arguments.grouping} "
+        f"{out}: {described} of {length} dimensions, grouping {arguments.grouping} "
         f"({GROUPINGS[arguments.grouping]}), images at {images}{skipped}"
     )
     return {

@@ -14,11 +14,11 @@ if TYPE_CHECKING:  # commands that load no model of a file start without these
 
 RuntimeName = Literal["jax", "onnxruntime", "openvino"]
 QueryRuntimeName = Literal["auto", "jax", "onnxruntime", "openvino"]
-"""What computes a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
+"""What runs a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
 
 
 class Target(NamedTuple):
-    """Marks a flag that names what a command writes, to check it before any work."""
+    """Mark of a flag that names a command's output, which is checked before any work."""
 
     suffixes: tuple[str, ...] = ()
     """Suffixes that the file's name may have; empty allows any."""
@@ -42,35 +42,35 @@ class Flags:
 
 
 class JsonFlag(Flags):
-    """Where the result goes as JSON."""
+    """Flag for JSON output."""
 
     json: Annotated[pathlib.Path | None, Target((".json",))] = None
     """File for the result as JSON; - prints it."""
 
 
 class TableFlags(JsonFlag):
-    """Where a result with tables goes."""
+    """Flags for JSON and LaTeX output."""
 
     latex: Annotated[pathlib.Path | None, Target((".tex",))] = None
     """File for the tables as LaTeX (package booktabs); - prints them."""
 
 
 class PluginFlag(Flags):
-    """Where custom parts come from."""
+    """Flag for plugins."""
 
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register custom parts or models; their code is run."""
 
 
 class QuietFlag(Flags):
-    """Whether progress is shown."""
+    """Flag that hides progress."""
 
     quiet: bool = False
     """Hide progress bars."""
 
 
 class DecodeFlags(PluginFlag, QuietFlag):
-    """How large an image may be."""
+    """Flags for image and batch sizes."""
 
     max_pixels: int = 2**28
     """Maximum pixels of an image file; larger ones are not decoded."""
@@ -79,21 +79,21 @@ class DecodeFlags(PluginFlag, QuietFlag):
 
 
 class ReadFlags(DecodeFlags):
-    """How images are read."""
+    """Flags for reading images."""
 
     on_bad_image: Literal["stop", "skip"] = "stop"
-    """Stop at an unreadable image, or leave it out and say so."""
+    """Stop at an unreadable image, or leave it out and report it."""
 
     @property
     def reading(self) -> "Reading":
-        """These flags as the library takes them."""
+        """These flags in the form that the library takes."""
         from crisalad_jax.data.reading import Reading
 
         return Reading(batch_size=self.batch_size, on_bad_image=self.on_bad_image, quiet=self.quiet)
 
 
 class ClusterFlag(Flags):
-    """Where the work is done."""
+    """Flag for a Ray cluster."""
 
     cluster: str | None = None
     """Ray cluster that does the work: local, auto, ray://HOST[:PORT] or HOST:PORT
@@ -101,7 +101,7 @@ class ClusterFlag(Flags):
 
 
 class FrameFlags(Flags):
-    """Which frames of videos and robot logs are taken."""
+    """Flags that choose frames of videos and robot logs."""
 
     fps: float | None = None
     """Frames per second from a video or robot log, by default 1."""
@@ -110,12 +110,12 @@ class FrameFlags(Flags):
 
 
 class SizeFlags(Flags):
-    """At which size images are described, and how they get it."""
+    """Flags for image size and resizing."""
 
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's, or the map's."""
     resize: tuple[str, ...] = ()
-    """Values that replace the model's: fixed, shorter-side, longer-side or native; bilinear,
+    """Settings that replace the model's: fixed, shorter-side, longer-side or native; bilinear,
     bicubic or area; antialias or no-antialias; bytes or floats; round;
     high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
 
@@ -125,11 +125,11 @@ class SizeFlags(Flags):
 
 
 class ComputeFlags(SizeFlags):
-    """At which size and in which type images are described."""
+    """Flags for image size, resizing and compute type."""
 
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's, or the map's; docs/performance.md shows
-    what bfloat16 gains and loses."""
+    the effects of bfloat16."""
 
     def applied_to(self, config: "ModelConfig") -> "ModelConfig":
         """Apply these flags to the configuration of a model."""
@@ -139,55 +139,55 @@ class ComputeFlags(SizeFlags):
 
 
 class ModelFlags(ComputeFlags, QuietFlag):
-    """Which model describes images, and how."""
+    """Flags that choose the model and how it runs."""
 
     weights: pathlib.Path | None = None
-    """By default starter, the small model in this package; or hog or thumbnail, which learn
-    nothing; or a .safetensors file, or a published model's name (`crisalad models`), or
-    hf://OWNER/NAME at Hugging Face's hub."""
+    """By default starter, the small model in this package. Otherwise a .safetensors file, a
+    published model's name (`crisalad models`), hf://OWNER/NAME on Hugging Face's hub, or an
+    untrained baseline: hog or thumbnail."""
     runtime: RuntimeName = "jax"
-    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
-    for it once; --weights may be an exported folder."""
+    """Engine that runs the model (docs/export.md). Weights are exported for it once; --weights may
+    be an exported folder."""
     checksums: bool = True
     """Check all files against their checksums; --no-checksums skips that for huge files."""
 
 
 class MapFlags(Flags):
-    """Which map is queried, and with which model."""
+    """Flags that choose the map and its model."""
 
     map: pathlib.Path
     """Folder that `crisalad index` wrote."""
     weights: pathlib.Path | None = None
-    """The model that made the map, as a file or published name; by default at its recorded path."""
+    """Model that made the map, a file or a published name; by default from its recorded path."""
     checksums: bool = True
     """Check the map's descriptors, and an exported model, against their checksums; --no-checksums
     skips that for huge files."""
 
 
 class PositionFlags(Flags):
-    """Where images were taken."""
+    """Flags for the positions of images."""
 
     positions: pathlib.Path | None = None
     """CSV of name,lat,lon or name,east,north or name,x,y (metres), for new images; or a track: GPX,
-    GeoJSON, or CSV of time,lat,lon. By default what a table as --images says, @UTM names, or EXIF
+    GeoJSON, or CSV of time,lat,lon. By default from a table given as --images, @UTM names, or EXIF
     data (docs/how-to/image-sources.md)."""
     start_time: str | None = None
-    """When the video began, for a track as --positions: 2026-05-01T12:00:00+02:00."""
+    """When the video began, for a track as --positions, as in 2026-05-01T12:00:00+02:00."""
     time_offset: float | None = None
-    """Seconds to add to images' times, for a track as --positions: -7200 if the camera's clock is
-    two hours ahead of UTC."""
+    """Seconds to add to images' times, for a track as --positions, as in -7200 if the camera's
+    clock is two hours ahead of UTC."""
 
 
 class PlaceFlags(PositionFlags):
-    """Where images were taken, and how far from each other they have to be."""
+    """Flags for the positions of images and the distance between them."""
 
     every_metres: float | None = None
-    """Take an image only if it is that far from the last one taken of its folder or video; images
-    without a position are taken."""
+    """Take an image only if it is at least this far from the last one taken from its folder or
+    video; images without a position are always taken."""
 
 
 class SetFlags(Flags):
-    """Which evaluation set, and what counts as a positive."""
+    """Flags for the evaluation set and its positives."""
 
     data: pathlib.Path
     """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
@@ -195,19 +195,19 @@ class SetFlags(Flags):
     split: str | None = None
     """train, val or test, if the set has several."""
     layout: str | None = None
-    """utm, vpr-bench, netvlad, salad, msls, msls-subtask or folders; by default what DATA looks
-    like (msls-subtask, the 740 queries of raw MSLS, only by name)."""
+    """utm, vpr-bench, netvlad, salad, msls, msls-subtask or folders; by default detected
+    from DATA (but not msls-subtask, the 740 queries of raw MSLS)."""
     images: pathlib.Path | None = None
-    """Folder of the images that a .mat file or .npy lists name; by default the file's."""
+    """Folder of the images that a .mat file or .npy lists name; by default the file's folder."""
     queries: str | None = None
-    """Folder of the queries, if a @UTM set has several: queries_night of SVOX; by default
+    """Folder of the queries, if a @UTM set has several, such as queries_night of SVOX; by default
     queries."""
     ignore_zones: bool = False
-    """Compare @UTM numbers of all zones as if on one plane, as the public tools do."""
+    """Compare @UTM coordinates of all zones as if on one plane, as the public tools do."""
     radius: float | None = None
     """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
     max_heading_difference: float | None = None
-    """Largest difference of compass angles of a positive in degrees, for raw MSLS; by default any
-    (the paper: 40)."""
+    """Largest heading difference of a positive in degrees, for raw MSLS; by default any (the
+    CriSALAD paper: 40)."""
     frames: int | None = None
-    """How many frames a positive may be away, for two plain folders of the same moments."""
+    """Largest distance of a positive in frames, for two plain folders with matching frames."""

@@ -90,7 +90,7 @@ def _heading(action: argparse.Action) -> str:
 
 
 _DEFAULT = re.compile(r"\s*\((?:default: (.*?)|required)\)\s*$", re.DOTALL)
-"""What tyro adds to a flag's text."""
+"""Suffix that tyro adds to a flag's text."""
 
 
 def _shorten(action: argparse.Action, width: int) -> None:

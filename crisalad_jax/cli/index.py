@@ -33,19 +33,19 @@ class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag
     """The map's folder. After a kill the same command resumes."""
     position_topic: str | None = None
     """Topic of positions in a robot log, by default the only NavSatFix, else the only odometry or
-    pose; none takes none."""
+    pose; none ignores positions."""
     novelty: float | None = None
-    """Take an image only if its similarity to the last one taken of its folder or video is at most
-    this, such as 0.9."""
+    """Take an image only if its similarity to the last one taken from its folder or video is at
+    most this, such as 0.9."""
     store: str | None = None
-    """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
-    map's, and files for a new map."""
+    """Where to store descriptors: files, in the map's folder, or milvus:URI, a file name.db or
+    http://host:port; by default as in the map, or files for a new map."""
     dtype: Literal["float32", "float16", "bits"] | None = None
     """Type of descriptors in files, by default the map's, or float32 in a new map; bits are their
     signs (docs/maps.md)."""
     pca: pathlib.Path | None = None
-    """Components of `crisalad pca`, for shorter descriptors; the map has a copy, which queries
-    use."""
+    """Components of `crisalad pca`, for shorter descriptors; the map stores a copy for
+    queries."""
     search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None
     """Build an approximate search, and print its recall; exact removes it, and auto chooses by size
     and memory (docs/large.md). Only Milvus has diskann."""
@@ -83,10 +83,10 @@ def _words(result: Indexed, config: ModelConfig) -> list[str]:
     fates = (
         (result.there, "were there already"),
         (result.removed, "were removed from the map and stay out (--again adds them)"),
-        (result.stay, "positions given are of such, and stay as they are"),
+        (result.stay, "given positions ignored, as the map has these images"),
         (result.near, "nearer than --every-metres left out"),
         (result.similar, "more similar than --novelty left out"),
-        (len(unmatched), f"positions given are of no image here, {first_of(unmatched)}"),
+        (len(unmatched), f"given positions match no image here, {first_of(unmatched)}"),
         (len(unreadable), f"unreadable left out, {first_of(unreadable)}"),
     )
     length, store = metadata.length_words, metadata.store

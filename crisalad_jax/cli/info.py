@@ -13,19 +13,19 @@ from crisalad_jax.training.summary import model_summary, summary_json, summary_l
 
 
 class Info(SizeFlags, PluginFlag, TableFlags):
-    """Print what a model consists of: parameters, which train, multiply-accumulates per image."""
+    """Print what a model consists of: parameters, what trains, multiply-accumulates per image."""
 
     preset: str | None = None
-    """tiny, s14, b14 (the default), l14 or g14."""
+    """Model size: tiny, s14, b14 (the default), l14 or g14."""
     weights: pathlib.Path | None = None
-    """Describe the model in this file of this package instead, or a published one, by its name."""
+    """Describe this model instead: a file of this package, or a published model's name."""
     map: pathlib.Path | None = None
     """Describe the map in this folder instead."""
     checksums: bool = False
-    """Read all of the map's descriptors, and compare them with their digests."""
+    """Read all of the map's descriptors, and compare them with their checksums."""
     trainable: str | None = None
-    """What trains, as in `train`: values such as all or adapters,head, or patterns of names; by
-    default the recipe's, for a file adapters,head, or head if it has no adapter."""
+    """Parameters that train, as in `train`: all, adapters,head and the like, or patterns of names;
+    by default the recipe's, for a file adapters,head, or head if it has no adapter."""
     batch_size: int = 16
     """Images that attend to each other in the cross-image encoder."""
 

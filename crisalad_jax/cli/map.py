@@ -46,7 +46,7 @@ class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
         tyro.conf.arg(metavar="{list,remove,replace,move,merge}"),
     ]
     """List folders, days and additions; remove images; replace those whose files in --images have
-    changed; move images to --positions; or merge other maps into it, or into a new one."""
+    changed; move images to --positions; or merge other maps into this or a new one."""
     map: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="MAP")]
     """The map's folder."""
     what: Annotated[
@@ -62,7 +62,7 @@ class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     day: str | None = None
     """With list and remove: only images that were added on this day, as YYYY-MM-DD (UTC)."""
     store: str | None = None
-    """With merge: where a new map's descriptors are, files or milvus:URI as in `crisalad index`."""
+    """With merge: where a new map stores them, files or milvus:URI as in `crisalad index`."""
     images: pathlib.Path | None = None
     """With replace: where the changed images are, under the same names, as in `crisalad index`."""
     fps: float | None = None
@@ -76,7 +76,7 @@ _FLAGS = {
     "move": ("positions", "start_time", "time_offset"),
     "merge": ("store",),
 }
-"""The flags of each action that not all actions have."""
+"""The flags that only some actions have, by action."""
 
 
 def needs_jax(arguments: Map) -> bool:
@@ -163,7 +163,7 @@ _DONE = {
     "move": ("moved", "have these positions already"),
     "merge": ("added", "were there already"),
 }
-"""Words for images that an action changed, and for those that it did not need to."""
+"""Text for images that an action changed, and for those that it did not need to."""
 
 
 def _words(change: MapChange, action: str) -> list[str]:
@@ -174,7 +174,7 @@ def _words(change: MapChange, action: str) -> list[str]:
         (change.there, there),
         (change.stay_out, "were removed from this map and stay out"),
         (len(unmatched), f"are not in the map, {first_of(unmatched)}"),
-        (len(unreadable), f"unreadable stay as they were, {first_of(unreadable)}"),
+        (len(unreadable), f"unreadable left unchanged, {first_of(unreadable)}"),
     )
     words = [
         f"{counted(len(change.names), 'image')} {done}" if change.names else "nothing to do",

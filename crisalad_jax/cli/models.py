@@ -20,7 +20,7 @@ class Models(PluginFlag, TableFlags):
     """List the models that others published, which --weights takes by name, or describe one."""
 
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None
-    """Print all that is known about it."""
+    """Model to describe in full."""
 
 
 def run(arguments: Models) -> dict[str, Any]:
@@ -40,8 +40,8 @@ def run(arguments: Models) -> dict[str, Any]:
         "by default"
     )
     for name in ("starter-1", "hog", "thumbnail"):
-        echo(f"{name}: {_NOTES[name]}, by its name too")
-    echo("crisalad models NAME prints all of one: its images, paper, file and address")
+        echo(f"{name}: {_NOTES[name]}, also by name")
+    echo("crisalad models NAME prints all about one: its images, paper, file and address")
     return {"cache": str(user_cache()), "models": [_facts(model) for model in models]}
 
 
@@ -60,7 +60,7 @@ _NOTES = {
 
 
 def _own_facts(name: str) -> dict[str, Any]:
-    """Return what is known about a model in this package, in the form for published ones."""
+    """Return what is known about a model in this package, as `_facts` does for published ones."""
     params, config = load_weights(starter.FILES[name])
     unsaid = dict.fromkeys(field.name for field in dataclasses.fields(Published))
     return unsaid | {

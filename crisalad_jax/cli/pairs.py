@@ -29,22 +29,22 @@ class Pairs(ReadFlags, JsonFlag):
     root: pathlib.Path | None = None
     """Folder that names are relative to, COLMAP's image_path; by default that of the images."""
     k: int = 20
-    """Each image with its k most similar ones; 0 for none of these."""
+    """Pair each image with this many most similar ones; 0 makes no such pairs."""
     min_similarity: float = -1.0
-    """Minimum similarity of these."""
+    """Minimum similarity of such pairs."""
     min_gap: float | None = None
-    """Minimum seconds between these, by the times in their names: loop closures."""
+    """Minimum seconds between the two images, by the times in their names: for loop closures."""
     overlap: int = 0
-    """Also each image with this many next ones of its folder or video."""
+    """Also pair each image with this many next ones in its folder or video."""
     within: float | None = None
-    """Also images at most this many metres apart, if positions are known."""
+    """Also pair images at most this many metres apart, if positions are known."""
     weights: pathlib.Path | None = None
     """Model for --images; by default the one that made the map, or starter. A file or a published
     name."""
     fps: float | None = None
     """Frames per second from a video, by default 1."""
     runtime: RuntimeName = "jax"
-    """What computes the model: jax, onnxruntime or openvino (docs/export.md)."""
+    """Engine that runs the model (docs/export.md)."""
     checksums: bool = True
     """Check files against their checksums; --no-checksums skips that for huge files."""
 
@@ -94,7 +94,7 @@ def run(arguments: Pairs) -> dict[str, Any]:
 
 
 def _index(arguments: Pairs, folder: pathlib.Path) -> list[str]:
-    """Describe --images into a map, and return the names of those that cannot be read."""
+    """Index --images into a map, and return the names of unreadable ones."""
     from crisalad_jax.checkpoints.load import open_model
     from crisalad_jax.retrieval.maps.build import index
 

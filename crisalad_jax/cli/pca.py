@@ -33,7 +33,7 @@ class Pca(JsonFlag, QuietFlag):
     samples: int = SAMPLES
     """Maximum number of descriptors to fit, drawn at random."""
     seed: int = 0
-    """Their seed."""
+    """Seed of that draw."""
     checksums: bool = True
     """Check descriptors against their checksums; --no-checksums skips that for huge files."""
 
@@ -44,7 +44,7 @@ def run(arguments: Pca) -> dict[str, Any]:
     checked = {"verify": arguments.checksums}
     model = None if weights is None else load(weights, quiet=arguments.quiet, **checked)
     dim = model.config.projection.dim if model else 0
-    require(not dim, f"{weights}: found a model with a projection to {dim} numbers already")
+    require(not dim, f"{weights}: found a model with a projection to {dim} dimensions already")
     descriptors = open_npy(arguments.descriptors, **checked)
     made = read_record(arguments.descriptors)
     pca = fit_pca(

@@ -58,43 +58,42 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     (docs/how-to/image-sources.md).
     None with --watch or --camera."""
     watch: pathlib.Path | None = None
-    """Folder: answer the images that appear in it as they appear, a line of JSON each."""
+    """Folder to watch: answer each new image as it appears, with a line of JSON."""
     camera: str | None = None
-    """Number from 0, URL, video or robot log: answer its newest frame, repeatedly."""
+    """Camera number from 0, URL, video or robot log: answer its newest frame, repeatedly."""
     rate: float | None = None
-    """Playback speed of a file as --camera, relative to its own; by default 1."""
+    """Playback speed of a file as --camera, relative to real time; by default 1."""
     fps: float | None = None
-    """Frames per second from a video or log, by default 1; the most that --camera answers."""
+    """Frames per second from a video or log, by default 1; with --camera, the maximum to answer."""
     window: int = 1
-    """Frames of a moving camera described together, each with those just before."""
+    """Number of frames described together: each of a moving camera with those just before it."""
     runtime: QueryRuntimeName = "auto"
-    """What computes the model: jax, onnxruntime or openvino (docs/export.md); auto is the fastest
-    that is installed and agrees with jax. Weights are exported for it once; --weights may be an
-    exported folder."""
+    """Engine that runs the model (docs/export.md); auto is the fastest that is installed and agrees
+    with jax. Weights are exported for it once; --weights may be an exported folder."""
     k: int = 5
-    """Answers to each query."""
+    """Answers per query."""
     min_similarity: float | None = None
     """Similarity of the best answer below which the place is unknown; by default what `crisalad
     calibrate` measured for this map. -1 answers every query."""
     sequence: Literal["bayes", "seqslam"] | None = None
-    """The queries are consecutive frames of one camera: bayes, a filter, weighs all so far; seqslam
-    searches lines through the last ones (docs/maps.md)."""
+    """Treat the queries as consecutive frames of one camera: bayes, a filter, weighs all so
+    far; seqslam searches lines through the last ones (docs/maps.md)."""
     sequence_reach: float | None = None
     """Largest speed of this camera relative to the map's; by default 2. If names have no times or
-    positions, images of the map per frame."""
+    positions, in map images per frame."""
     sequence_length: int | None = None
-    """Frames that seqslam's lines go through; by default 10."""
+    """Length of seqslam's lines in frames; by default 10."""
     where: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Search only some of the map's images: 'folder=monday, added>=2026-05-01,
-    box=west,south,east,north', of which any may be left out; also time>= (docs/maps.md)."""
+    box=west,south,east,north', each condition optional; also time>= (docs/maps.md)."""
     exact: bool = False
     """Search exactly, even if the map has an approximate search."""
     json: Annotated[pathlib.Path | None, Target((".json", ".jsonl"))] = None
     """File for the answers: .jsonl, a line of JSON for each query, or .json, a list; - prints
     lines."""
     out: Annotated[pathlib.Path | None, Target(POSITION_SUFFIXES)] = None
-    """File for where the queries were taken, by its suffix: .csv, which --positions takes, or
-    .geojson, .gpx or .kml, in degrees."""
+    """File for the queries' positions, in the format of its suffix: .csv, which --positions takes,
+    or .geojson, .gpx or .kml, in degrees."""
     gallery: Annotated[pathlib.Path | None, Target((".png", ".svg", ".pdf"))] = None
     """PNG, SVG or PDF of up to 24 queries with up to 8 answers each."""
     rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
@@ -111,12 +110,11 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     matcher: pathlib.Path | None = None
     """ONNX file of features and their matcher, such as ALIKED + LightGlue; by default SIFT."""
     intrinsics: str | None = None
-    """The camera's fx,fy,cx,cy, or with ,width,height, or a file: YAML or JSON of ROS's
-    camera_info."""
+    """The camera's fx,fy,cx,cy[,width,height], or a file: YAML or JSON of ROS's camera_info."""
     map_intrinsics: str | None = None
     """Intrinsics of the map's camera, if different."""
     map_depth: pathlib.Path | None = None
-    """Folder of 16-bit PNGs: depth of the map's images in millimetres, under their names."""
+    """Folder of 16-bit PNGs with the names of the map's images: their depth in millimetres."""
 
 
 def needs_jax(arguments: Query) -> bool:
@@ -156,7 +154,7 @@ def run(arguments: Query) -> None:
         for line in json_lines(answers):
             print(line)
     written = {}
-    with contextlib.ExitStack() as staged:  # so that both files appear, or none
+    with contextlib.ExitStack() as staged:  # so that all files appear, or none
         if gallery is not None:
             from crisalad_jax.experiments.report import save, show_retrievals
 
@@ -239,7 +237,7 @@ def _opened(arguments: Query) -> Iterator[tuple[Map, str]]:
     """Open the map, and its model in the engine that the flags ask for, or in the fastest.
 
     Yields:
-        (map, words that name the engine).
+        (map, text that names the engine).
     """
     verify, runtime = arguments.checksums, arguments.runtime
     calibrated = arguments.min_similarity is None
@@ -257,7 +255,7 @@ def _opened(arguments: Query) -> Iterator[tuple[Map, str]]:
 def _unknown_words(answers: Answers, places: Map) -> str:
     """Describe how many queries are of unknown places, and how the threshold was measured.
 
-    It is empty if any similarity counts.
+    The text is empty if no threshold is set.
     """
     below = []
     if answers.min_similarity is not None:
@@ -331,7 +329,7 @@ def _run_live(arguments: Query) -> None:
         if arguments.watch is not None:
             source = FolderWatch(arguments.watch)
             verb = "is" if source.there == 1 else "are"
-            there = f"{counted(source.there, 'image')} {verb} there"
+            there = f"{counted(source.there, 'image')} {verb} there already"
             words = f"watching {arguments.watch} ({there}, and left out)"
         else:
             assert arguments.camera is not None

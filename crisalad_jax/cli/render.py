@@ -26,9 +26,9 @@ class Render(JsonFlag, QuietFlag):
     scenes: int = WorldConfig.scenes
     """Scenes to train on."""
     stations: int = WorldConfig.stations
-    """Places of a scene, one behind another; they look similar."""
+    """Places per scene, one behind another; they look similar."""
     images_per_place: int = WorldConfig.images_per_place
-    """Images of a place; weather, light, season, traffic and viewpoint vary."""
+    """Images per place; weather, light, season, traffic and viewpoint vary."""
     test_scenes: int = WorldConfig.test_scenes
     """Other scenes, to test on."""
     image_size: tuple[int, int] = WorldConfig.image_size
@@ -36,9 +36,9 @@ class Render(JsonFlag, QuietFlag):
     sceneries: tuple[Scenery, ...] = SCENERIES
     """Kinds of places, in turn."""
     repaint: float = WorldConfig.repaint
-    """Largest deviation of objects' log colour between images."""
+    """Largest standard deviation of objects' log colour between images."""
     varied: tuple[Variation, ...] = VARIATIONS
-    """What changes between a place's training images, in addition to paint. Test images change in
+    """What changes between a place's training images, in addition to paint. Test images vary in
     all of these."""
     hard: float = WorldConfig.hard
     """Share of images taken from far to the side, turned, or through a crowd."""
@@ -54,7 +54,7 @@ def run(arguments: Render) -> dict[str, Any]:
     is_new = write_world(arguments.out, config, quiet=arguments.quiet)
     tests = config.test_scenes * config.stations
     echo(
-        f"{arguments.out}: {'' if is_new else 'there already, '}{counted(places, 'place')} with "
+        f"{arguments.out}: {'' if is_new else 'already rendered, '}{counted(places, 'place')} with "
         f"{counted(config.images_per_place, 'image')} each in {arguments.out / 'train'}; "
         f"{counted(tests, 'other place')} in {arguments.out / 'test'}"
     )

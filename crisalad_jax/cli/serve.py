@@ -18,24 +18,24 @@ class Serve(DecodeFlags, MapFlags):
     """Answer over HTTP, and in a browser, where photographs were taken."""
 
     host: str = "127.0.0.1"
-    """Name or address to listen on; others than this machine's own need a token."""
+    """Name or address to listen on; any but this machine's own needs a token."""
     port: int = 8000
     """Port to listen on; 0 is any free one."""
     token_file: pathlib.Path | None = None
-    """File of the token that requests must send; by default the variable CRISALAD_TOKEN."""
+    """File of the token that requests must send; by default from the variable CRISALAD_TOKEN."""
     append: bool = False
     """Let requests add images to the map; no other process can append then."""
     map_images: pathlib.Path | None = None
     """Folder of the map's pictures, if they were moved."""
     runtime: QueryRuntimeName = "auto"
-    """What computes the model; see `crisalad query`."""
+    """Engine that runs the model; see `crisalad query`."""
     k: int = 5
-    """Answers to a picture, if the request gives no number."""
+    """Answers per picture, if the request sets no number."""
     tiles: str | None = None
-    """Address of a street map behind the page's map, which browsers then ask for the tiles:
+    """URL of street map tiles, which browsers then load behind the page's map:
     https://tile.openstreetmap.org/{z}/{x}/{y}.png."""
     tiles_attribution: str | None = None
-    """Text to show with the tiles; by default OpenStreetMap's, for its own."""
+    """Text to show with the tiles; by default OpenStreetMap's, for its tiles."""
     rerank: str | None = None
     """local:N verifies the N best answers by local features; local, the first 5
     (docs/verification.md)."""

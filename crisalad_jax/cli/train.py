@@ -27,7 +27,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
 
     data: tuple[pathlib.Path, ...]
     """Folder with a folder per place, a table name,place[,lat,lon[,heading]] (places.csv in the
-    folder, or the file), or Dataframes/ and Images/ of GSV-Cities, here or at an address as in
+    folder, or the file), or Dataframes/ and Images/ of GSV-Cities, local or at an address as in
     s3://bucket/places; for netvlad, patch-netvlad and selavpr, which mine tuples, a training set of
     queries in any layout that `evaluate` reads. Or several sets of places, as NAME=DIR NAME=DIR:
     each step takes a sub-batch of each, as --mixture.NAME.sampler, loss, share and weight say."""
@@ -42,7 +42,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     neighbouring places."""
     positions: pathlib.Path | None = None
     """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for --place-radius; by default
-    what a table as --data says, or @UTM names, or EXIF data."""
+    from a table given as --data, @UTM names, or EXIF data."""
     fps: float | None = None
     """Frames per second from a video or robot log as --data."""
     topic: str | None = None
@@ -63,7 +63,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from. With
     --weights it is the file's."""
     recipe: str | None = None
-    """How it trains. As published: crisalad (the paper; the default), crisalad-1e-4 or
+    """How to train. As published: crisalad (the paper; the default), crisalad-1e-4 or
     crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
     vlad-buff, selavpr (preset l14), selavprpp, salad-cm (of two sets); over ResNet boq-resnet50,
     conv-ap, cosplace, mixvpr; over VGG netvlad, patch-netvlad. In part as published:
@@ -87,7 +87,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     num_processes: int | None = None
     """Number of processes, with --coordinator-address HOST:PORT."""
     process_id: int | None = None
-    """Which of them this is, from 0."""
+    """Number of this process, from 0."""
     local_device_ids: tuple[int, ...] | None = None
     """GPUs of this host for this process, with --coordinator-address. By default one: that of the
     process's number on its host, if Slurm, Open MPI or a coordinator at localhost gives it."""
@@ -111,7 +111,7 @@ def parse(program: str, arguments: Sequence[str]) -> Train:
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
-    """Find the file of --weights, whose model determines the flags, and pass it.
+    """Find the file of --weights, whose model determines the flags, and pass it on.
 
     Raises:
         InputError: what `find_weights` and `read_model` raise; or several processes would download
@@ -152,18 +152,18 @@ def command(arguments: Sequence[str]) -> type:
 
 
 def preset_of(arguments: Sequence[str]) -> str:
-    """Return the preset that parts are sized by."""
+    """Return the preset that sizes the parts."""
     return find_flag(arguments, "--preset") or "b14"
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
     """Read the configuration that flags start from.
 
-    It is that of --config; or of --preset and --recipe, with the model of --weights if there
-    is such a file (`prepare` finds it). If --data names sets, it is a configuration for them.
+    It comes from --config; or from --preset and --recipe, with the model of --weights if that
+    file exists (`prepare` finds it). If --data names sets, it has settings for each.
 
     Raises:
-        InputError: both are given, or one of them does not exist.
+        InputError: --config is given with one of the others, or one of them does not exist.
     """
     given, data = find_flag(arguments, "--config"), flag_values(arguments, "--data")
     require(len(data) < 2, "--data: found twice, expected all sets after one: NAME=DIR NAME=DIR")

@@ -18,7 +18,7 @@ class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     out: Annotated[pathlib.Path, WEIGHTS]
     """A .safetensors file."""
     weights: pathlib.Path | None = None
-    """A model of AnyLoc, NetVLAD or a custom part with a vocabulary, to replace it; a file, or a
+    """Model whose vocabulary is replaced: AnyLoc, NetVLAD or a custom part with one; a file, or a
     published model's name."""
     backbone: pathlib.Path | None = None
     """Any checkpoint that `convert` reads, or a published model's name, as in dinov2-vitg14: its
@@ -30,9 +30,9 @@ class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     """With --preset: anyloc (the default), or another that starts from centroids, such as netvlad
     or a custom part; or sift-vlad, sift-bow or orb-bow, which need no backbone."""
     clusters: int | None = None
-    """Words, if the aggregator has such a setting; by default the preset's."""
+    """Number of words, if the aggregator has this setting; by default the preset's."""
     layer: int | None = None
-    """AnyLoc's block, from 0, or from the end if negative; by default the preset's."""
+    """Block that AnyLoc reads, from 0, or from the end if negative; by default the preset's."""
     facet: str | None = None
     """What AnyLoc takes from that block: query, key, value or token; by default its values."""
     assignment: str | None = None
@@ -40,7 +40,7 @@ class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     max_images: int = IMAGES
     """Maximum number of images to read, drawn at random."""
     seed: int = 0
-    """Seed of the images, patches of each, first centroids and a random backbone."""
+    """Seed of the draws of images and patches, of the first centroids, and of a random backbone."""
 
 
 def run(arguments: Vocabulary) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def run(arguments: Vocabulary) -> dict[str, Any]:
     config, name = model.config, model.config.aggregator.part_name
     echo(
         f"{arguments.out}: {name}, {built.words} words from {built.images} images at "
-        f"{config.images_in_words}, descriptors of {config.descriptor_dim} numbers"
+        f"{config.images_in_words}, descriptors of {config.descriptor_dim} dimensions"
     )
     return {
         "out": str(arguments.out),

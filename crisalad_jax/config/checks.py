@@ -58,7 +58,7 @@ def check_seed(what: str, seed: int) -> None:
     """Check a seed, as `Seed` does.
 
     Raises:
-        InputError: it is not a whole number, negative, or has more than 32 bits.
+        InputError: it is not a whole number, is negative, or has more than 32 bits.
     """
     allowed = kind_of(Seed)
     require(allowed.fits(seed), f"{what}: found {seed!r}, expected {allowed.words}")
@@ -83,7 +83,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
     """Make a decorator that checks the classes of a public function's arguments.
 
-    Swapped arguments then give an error of one line, not an AttributeError deep inside a call.
+    Swapped arguments then give a one-line error, not an AttributeError deep inside a call.
 
     Args:
         **kinds: the class, or the classes, of an argument by its name.
@@ -170,10 +170,10 @@ def limited(least: float, most: float = math.inf) -> Kind:
     return Kind(lambda value: least <= value <= most, words)
 
 
-# Types of fields whose numbers have a range. To all but `check_types` they are int and float.
+# Types of numeric fields with a range. To all but `check_types` they are int and float.
 PositiveInt = Annotated[int, Kind(lambda value: value >= 1, "a whole number of at least 1")]
 NonNegativeInt = Annotated[int, Kind(lambda value: value >= 0, "a whole number of at least 0")]
-# JAX drops higher bits, so such a seed would draw the same numbers as another one.
+# JAX drops higher bits, so a larger seed would draw the same values as a smaller one.
 Seed = Annotated[int, Kind(lambda value: 0 <= value < 2**32, "at least 0, and less than 2**32")]
 NonNegativeFloat = Annotated[float, limited(0)]
 Share = Annotated[float, limited(0, 1)]
@@ -228,6 +228,6 @@ def require_field(config: object, name: str, holds: bool, expected: str) -> None
 
 
 def require_range(config: object, least: float, most: float, name: str) -> None:
-    """Check a field against a range, both ends included, that other settings decide."""
+    """Check a field against a range, both ends included, that depends on other settings."""
     allowed = limited(least, most)
     require_field(config, name, allowed.fits(getattr(config, name)), allowed.words)

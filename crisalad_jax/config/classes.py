@@ -10,7 +10,7 @@ from crisalad_jax.config.short_repr import short_repr
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class ClassesConfig:
-    """How images form classes, and classes form groups, which epochs train in turn.
+    """How images form classes, and classes form groups, on which epochs train in turn.
 
     The constants are CosPlace's (Berton et al., CVPR 2022); see docs/methods.md.
 
@@ -20,10 +20,10 @@ class ClassesConfig:
     """
 
     kind: Literal["places", "cells", "viewpoints"] = "places"
-    """Kind of class: the training set's own places, CosPlace's cells of position and heading, or
+    """Kind of class: the training set's places, CosPlace's cells of position and heading, or
     EigenPlaces' cells of position with a focal point. The latter two need real positions."""
     groups: PositiveInt = 8
-    """Number of groups that train, those with the most classes; for viewpoints, this many lateral
+    """Number of groups to train on, those with the most classes; for viewpoints, this many lateral
     and this many frontal groups."""
     steps: PositiveInt | None = None
     """Number of steps in an epoch; None passes once over the largest group."""

@@ -33,7 +33,7 @@ def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "")
     Args:
         config: the configuration.
         arguments: the command line's arguments.
-        preset: preset of the model's and parts' sizes.
+        preset: preset of sizes for the model and its parts.
         path: dotted name of this configuration's own flag.
 
     Raises:
@@ -121,7 +121,7 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
     Args:
         config: the configuration to change.
         arguments: flags and values as on a command line; booleans are True or False.
-        preset: preset of the model's and parts' sizes.
+        preset: preset of sizes for the model and its parts.
         what: beginning of messages.
 
     Returns:
@@ -152,7 +152,7 @@ def refusals(arguments: Sequence[str], *, wide: bool = True) -> Iterator[None]:
 
     Args:
         arguments: the command line's arguments, to find the flag of a value.
-        wide: whether the block prints nothing but a box; a help must fit the terminal.
+        wide: whether the block prints nothing but a box; a help text must fit the terminal.
 
     Raises:
         InputError: one line; or the one that a configuration's own check raised.
@@ -262,7 +262,7 @@ def _or_none(values: str) -> str:
 
 def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
     """Describe arguments that tyro does not accept: unknown flags, or too many values."""
-    if not tokens:  # with commas or spaces in them
+    if not tokens:  # values with commas or spaces in them
         return "found values without a flag before them"
     flags = [token.partition("=")[0] for token in tokens if token.startswith("-")]
     if flags:
@@ -288,7 +288,7 @@ def parse_settings(
         program: the command's name, for messages.
         arguments: the command line's arguments.
         defaults: the configuration that flags start from.
-        preset: preset of the model's and parts' sizes.
+        preset: preset of sizes for the model and its parts.
 
     Returns:
         An instance of `kind`.

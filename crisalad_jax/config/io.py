@@ -28,7 +28,7 @@ def to_plain(config: Any) -> Any:
     A part of a plug-in also has the plug-in's name, so that messages can name a missing plug-in.
 
     Raises:
-        InputError: a value is neither a number, text, nor a list of them.
+        InputError: a value is not a number, text or a list of these.
     """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
         fields = {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
@@ -95,7 +95,7 @@ def _class_and_fields(kind: Any, value: Any) -> tuple[Any, Mapping[str, Any]]:
 
 
 def _value(hint: Any, value: Any, path: str) -> Any:
-    """Convert a field's value to exactly its type: 3.7 is not a number of epochs."""
+    """Convert a value to exactly its field's type: 3.7 is not a number of epochs."""
     origin, (kind, *_) = typing.get_origin(hint), typing.get_args(hint) or (None,)
     if origin in (typing.Union, types.UnionType):
         # Every union here is of one type and None, or of a part and its name.

@@ -101,7 +101,7 @@ def parts_of(config: Any, prefix: str = "") -> dict[str, Part]:
 
 
 def non_semantic_field(default: _T) -> _T:
-    """Return a dataclass field that the outputs of given parameters do not depend on.
+    """Return a dataclass field that, for given parameters, does not affect a model's outputs.
 
     Examples are the initialisation, dropout and remat. Weight files that differ only in such fields
     hold the same model.

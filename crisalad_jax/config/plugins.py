@@ -99,7 +99,7 @@ def _spec_of(plugin: str) -> ModuleSpec | None:
         return None
     if (size := path.stat().st_size) > _LARGEST:
         raise InputError(
-            f"plugin {plugin}: found {size} bytes, expected a file of Python, of at most {_LARGEST}"
+            f"plugin {plugin}: found {size} bytes, expected a Python file of at most {_LARGEST}"
         )
     # Files of the same name are different modules.
     name = f"{_FROM_FILE}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"

@@ -40,7 +40,7 @@ class PreprocessingConfig:
     Published models differ in it, and another filter changes a descriptor by 1e-3 to 6e-2. The
     defaults are torchvision's chain on Pillow images: `Resize`, `ToTensor`, `Normalize`.
 
-    Normalising before or after the resize is the same: it is linear, and its weights sum to 1.
+    Normalising before or after resizing is the same: the resize is linear; its weights sum to 1.
 
     Example:
         >>> chain = PreprocessingConfig(filter="bicubic", pixels="floats")

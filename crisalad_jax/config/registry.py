@@ -116,7 +116,7 @@ class Registry(Generic[P]):
         except TypeError as error:
             raise InputError(
                 f"{error}; expected all methods, a default for every field, values that can be "
-                "hashed, such as tuples for lists, and presets of these fields"
+                "hashed, such as tuples instead of lists, and presets of these fields"
             ) from error
         part.part_name = name
         self._parts[name], self._presets[name] = with_field_docs(part), presets
@@ -162,7 +162,7 @@ class Registry(Generic[P]):
         return self._parts.get(name) or cast(type[P], self._find_other(name))
 
     def make(self, name: str, preset: str | None = None, **fields: Any) -> P:
-        """Make the part with this name, with the settings of the preset of model sizes.
+        """Make the part with this name, with its settings for a preset of model sizes.
 
         Raises:
             InputError: what `find` raises, or a field is out of range.
@@ -247,7 +247,7 @@ def part_field(registry: Registry[P], default: str | type[P]) -> Any:
 
 
 def resolve_names(config: Any) -> None:
-    """Check a new configuration's types, and replace names by parts.
+    """Check a new configuration's types, and replace names with parts.
 
     Raises:
         InputError: a name that is not registered, a value that is not a part of the kind, or what

@@ -45,7 +45,7 @@ def short_repr(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]
 def brief(cls: type[_T]) -> type[_T]:
     """Give a result class a `repr` with one line for each field, whatever its size.
 
-    Arrays print as type and shape, parameters as their number, collections as their first items.
+    Arrays print as type and shape, parameters as their count, collections as their first items.
     `help` shows the texts below the fields.
 
     Args:
@@ -146,7 +146,7 @@ def _short(value: Any) -> str:
     if isinstance(value, list | tuple):
         return _few("[]" if isinstance(value, list) else "()", len(value), map(_short, value))
     first, *more = repr(value).splitlines() or [""]
-    return f"{first}, {more[-1]}" if more else first  # parameters: their class and their number
+    return f"{first}, {more[-1]}" if more else first  # parameters: their class and count
 
 
 def _few(ends: str, count: int, items: Iterator[str]) -> str:
@@ -203,7 +203,7 @@ def with_field_docs(cls: type[_T]) -> type[_T]:
 class _Doc(str):
     """A docstring that is completed when it is shown: reading sources would slow down imports.
 
-    `help`, and `?` in a notebook, begin with `expandtabs`.
+    `help`, and `?` in a notebook, first call `expandtabs`.
     """
 
     kind: type

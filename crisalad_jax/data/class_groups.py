@@ -1,7 +1,7 @@
 """Group the classes that train a descriptor by classification (CosPlace, EigenPlaces).
 
-Two classes of one group are never neighbours, so images of one spot never belong to two of its
-classes. Each group is a separate training set (`Places`) whose places are the classes.
+Two classes of one group are never neighbours, so images of one spot never belong to two classes of
+a group. Each group is a separate training set (`Places`) whose places are the classes.
 """
 
 import collections
@@ -20,7 +20,7 @@ from crisalad_jax.utils.shapes import Bool, Float64, Int32, Int64
 
 _WIDEST = 60.0
 """Widest city in degrees of longitude; a wider plane stretches distances by over 15 %."""
-_ADVICE = "; --loss.kind.classes.kind places takes its places for classes"
+_ADVICE = "; --loss.kind.classes.kind places uses the set's places as classes"
 _ONE_SPOT = 1e-3
 """Smallest spread in metres of a cell's images that shows the direction of a street."""
 
@@ -57,8 +57,8 @@ def views_of(places: Places) -> Views:
         if (wide := np.ptp(here)) > _WIDEST:
             raise InputError(
                 f"{places.root}: found the images of {places.cities[number]} over {wide:.0f} "
-                f"degrees of longitude, expected at most {_WIDEST:g}, as cells are of one plane: "
-                "a set of several cities has a column city, or no columns lat,lon"
+                f"degrees of longitude, expected at most {_WIDEST:g}, as cells lie in one plane: "
+                "a set of several cities needs a column city, or no columns lat,lon"
             )
         known[number] = np.ptp(latitude[of]) > 0 or np.ptp(here) > 0
         east[of], north[of] = to_metres(latitude[of], here)
@@ -69,7 +69,7 @@ def known_views(places: Places, what: str, *, headings: bool) -> Views:
     """Return the views if all images have a position and, with `headings`, a heading too.
 
     Raises:
-        InputError: some have none, although `what` needs them; or what `views_of` raises.
+        InputError: some images lack one that `what` needs; or what `views_of` raises.
     """
     views = views_of(places)
     needed, column = ("headings, or no positions", ",heading") if headings else ("positions", "")
@@ -119,9 +119,9 @@ def class_groups(
             raise InputError(
                 f"{places.root}: found {fewest} classes of at least {min_images} images in the "
                 f"smallest of {len(chosen[-1])} groups, expected places_per_batch "
-                f"{places_per_batch}; fewer groups (--loss.kind.classes.groups) have more{_ADVICE}"
+                f"{places_per_batch}; lower --loss.kind.classes.groups to drop small ones{_ADVICE}"
             )
-    turns = zip(*chosen)  # noqa: B905, for as many of each set
+    turns = zip(*chosen)  # noqa: B905, to take equally many of each set
     return tuple(_regrouped(places, group) for turn in turns for group in turn)
 
 

@@ -1,8 +1,8 @@
 """A cache of remote files on disk, of bounded size, which several processes may share.
 
-fsspec's own caches of whole files have no size limit. Here each of 256 folders has an equal share
-of the space and evicts only its own least recently used files, so that no process waits for
-another. A kill at any moment leaves only complete files, and temporary ones that age like them.
+fsspec's caches of whole files have no size limit. Here each of 256 folders has an equal share of
+the space and evicts only its least recently used files, so that no process waits for another. A
+killed process leaves only complete files, and temporary ones, which are evicted like the others.
 """
 
 import contextlib
@@ -17,19 +17,19 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_folder
 
 CACHE_GB = 32.0
-"""Default size of the cache in gigabytes: GSV-Cities has 24."""
+"""Default size of the cache in gigabytes; GSV-Cities takes 24."""
 _FOLDERS = 256
 _SCANS = 32
-"""Parts of a folder's share. A folder is scanned, on average, once per part that is written, as it
-has too many files to count at every write. It then evicts four parts more than needed."""
+"""Number of parts of a folder's share. A folder has too many files to count at every write, so it
+is scanned, on average, once per part written, and then evicts four parts more than needed."""
 _DIGEST = 16
 
 
 class FileCache:
     """A cache of remote files; threads and processes may share its folder.
 
-    When a run first reads a file, it is compared with the remote one (size and ETag, or what the
-    store has); it is not checked again in that run.
+    When a run first reads a file, it is compared with the remote one (by size and ETag, or what the
+    store offers); it is not checked again in that run.
     """
 
     def __init__(self, folder: pathlib.Path, limit: float) -> None:
@@ -42,7 +42,7 @@ class FileCache:
         self._folder, self._share, self._began = folder, limit / _FOLDERS, time.time()
 
     def read(self, path: str | os.PathLike[str]) -> bytes:
-        """Read a remote file, from the cache if it has the same file.
+        """Read a remote file, from the cache if the copy there is current.
 
         Raises:
             InputError: it is in neither place, or the address cannot be accessed.
@@ -67,7 +67,7 @@ class FileCache:
         return data
 
     def _add(self, file: pathlib.Path, whole: bytes) -> None:
-        """Write a file that is smaller than a folder's share, unless the disk is full."""
+        """Write a file smaller than half a folder's share, unless the disk is full."""
         parts = len(whole) / self._share * _SCANS if self._share else _SCANS
         if parts < _SCANS / 2:
             with contextlib.suppress(InputError, OSError):

@@ -1,7 +1,7 @@
 """Names of frames of videos and robot logs, which include the time.
 
-A frame of a video is `walk.mp4#t=12.500`, in seconds of the file. A frame of a log (a ROS bag) is
-`walk.mcap#/camera/image_raw#t=1700000000.123456789`, with its topic and its stamp. Such names are
+A frame of a video is `walk.mp4#t=12.500`, with its time in seconds. A frame of a log (a ROS bag)
+is `walk.mcap#/camera/image_raw#t=1700000000.123456789`, with its topic and stamp. Such names are
 accepted wherever the path of an image is.
 """
 

@@ -96,7 +96,7 @@ def read_image(
         path: the image file, or a frame of a video, as in `walk.mp4#t=12.500` (seconds), or of a
             robot log (see docs/how-to/image-sources.md).
         size: height and width in pixels to resize to, with the defaults of `resize_image`; None
-            keeps the file's size. `prepare_image` resizes as a model's configuration says.
+            keeps the file's size. `prepare_image` resizes by a model's configuration.
         enough: height and width in pixels that the image will be resized to; None for full size.
         bit_depth: how more than 8 bits become 8; see `PreprocessingConfig`.
 
@@ -124,7 +124,7 @@ def read_pixels(
     enough: tuple[int, int] | None = None,
     read_far: Callable[[str | os.PathLike[str]], bytes] = read_remote,
 ) -> np.ndarray:
-    """Read an image file as `read_image` does, in the file's own depth; see `decode_image`.
+    """Read an image file as `read_image` does, at the file's bit depth; see `decode_image`.
 
     `read_far` reads the bytes of a remote file.
     """
@@ -143,7 +143,7 @@ def read_pixels(
 def decode_image(
     data: bytes, path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
 ) -> np.ndarray:
-    """Decode the bytes of an image file, in the file's own depth.
+    """Decode the bytes of an image file, at the file's bit depth.
 
     Args:
         data: all bytes of the file.
@@ -151,8 +151,8 @@ def decode_image(
         enough: see `read_image`.
 
     Returns:
-        The image, upright: RGB, or grey (height, width). PNG, TIFF and PNM of more than 8 bits
-        keep them; `prepare_image` reduces them to 8 as the model's configuration says.
+        The image, upright: RGB, or grey (height, width). PNG, TIFF and PNM may
+        have more than 8 bits, which `prepare_image` reduces to 8 by the model's configuration.
 
     Raises:
         InputError: what `read_image` raises.
@@ -179,7 +179,7 @@ def decode_image(
 
 
 def _decoded(data: np.ndarray, start: bytes, reduction: int) -> np.ndarray | None:
-    """Decode with the flags with which OpenCV reads a format correctly; None if it cannot."""
+    """Decode with the flags that OpenCV needs for a format; None if it cannot."""
     is_tiff, is_avif = start[:4] in _TIFF_SIGNATURES, start[4:] in _AVIF
     # With its RGB flag, OpenCV 5.0 mixes up red and blue in 16-bit TIFF and in AVIF with alpha.
     is_bgr = is_tiff or is_avif

@@ -26,7 +26,7 @@ from crisalad_jax.utils.output import warn
 _POLL = 0.05
 """Seconds between two scans of a folder, or four times a scan's duration if that is longer."""
 _SETTLED = 1.0
-"""Seconds for which a file of another format must stay unchanged to count as complete."""
+"""Seconds for which a file other than a JPEG or PNG must stay unchanged to count as complete."""
 _PATIENCE = 5.0
 """Seconds for which an unreadable file must stay unchanged to be given up."""
 _TURN = 0.1
@@ -44,7 +44,7 @@ class Frame(NamedTuple):
     image: np.ndarray
     """RGB or grey, upright, in the depth of the file; 8 bits from a camera."""
     taken: float
-    """`time.perf_counter()` when it was available: a complete file, or a camera's frame."""
+    """`time.perf_counter()` when the file was complete, or the camera's frame arrived."""
     dropped: int = 0
     """Number of frames dropped between the previously taken frame and this one."""
 
@@ -100,7 +100,7 @@ class FolderWatch:
             check: called several times a second; it may raise to end the loop.
         """
         waiting: dict[pathlib.Path, tuple[tuple[int, int], float]] = {}
-        """A file's size and time of change, and since when it has these."""
+        """A file's size and time of change, and when these were first seen."""
         while True:
             check()
             begun = time.monotonic()
@@ -194,7 +194,7 @@ class LatestFrame:
             image: 8-bit RGB (height, width, 3), or anything else that `prepare_image` takes. It
                 must not change afterwards.
             stamp: its time in seconds, for example since 1970.
-            name: its name in the answer; None takes the camera and the time.
+            name: its name in answers; None takes "camera" and the time.
         """
         taken = time.perf_counter()
         name = frame_name("camera", round(1000 * stamp)) if name is None else name
@@ -237,8 +237,8 @@ class LatestFrame:
 class Camera(LatestFrame):
     """The newest frame of a camera, whenever one is requested; older ones are dropped.
 
-    A thread reads all frames from the camera, so that none waits in the camera's own queue. A video
-    file or a robot log plays at its own speed, like a camera.
+    A thread reads all frames from the camera, so that none waits in the camera's queue. A video
+    file or a robot log plays at its recorded speed, like a camera.
 
     Example:
         >>> import cv2, numpy as np
@@ -266,7 +266,7 @@ class Camera(LatestFrame):
         Args:
             camera: its number from 0, a URL, a video file, or a robot log (a ROS bag).
             fps: maximum frames per second that `frames` yields; None yields as many as requested.
-            rate: speed at which a file plays, as a multiple of its own.
+            rate: speed at which a file plays, as a multiple of the recorded one.
             topic: topic of the images in a robot log; None takes the only one that has any.
 
         Raises:
@@ -284,7 +284,7 @@ class Camera(LatestFrame):
         self._is_file = from_log or pathlib.Path(given).is_file()
         self._rate = rate
         self.name = _name(given)
-        """Its name in messages: no user or password of a URL."""
+        """Its name in messages, without a URL's user, password and query."""
         self._begins = pathlib.Path(given).name if self._is_file else self.name
         self.size: Size | None
         """Height and width of the frames; None if the camera does not report it."""

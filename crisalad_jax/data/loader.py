@@ -34,11 +34,11 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 BATCHES_AHEAD = 2
 THREADS = usable_cores()
-"""OpenCV releases the GIL while decoding: two cores decode about 500 photographs a second."""
+"""One per core, as OpenCV releases the GIL: two cores decode about 500 photographs a second."""
 
 
 _SMALL = 16
-"""Up to this many images are padded to a power of two, so that few sizes are compiled."""
+"""Batches of up to this many images are padded to a power of two, to compile few sizes."""
 
 
 @brief
@@ -48,8 +48,8 @@ class ImageBatch(NamedTuple):
     images: UInt8[np.ndarray, "batch h w 3"] | Float32[np.ndarray, "batch h w 3"]
     """8-bit pixels, or normalised floats; zeros where not valid."""
     labels: Int32[np.ndarray, " batch"]
-    """Place index, or tuple and role (`losses.pairs`); without groups, position in the list of
-    paths; -1 for padding."""
+    """Place index, or tuple and role as one number (`losses.pairs.tuple_labels`); without groups,
+    position in the list of paths; -1 for padding."""
     valid: Bool[np.ndarray, " batch"]
     indices: Int64[np.ndarray, " batch"]
     """Image index, also for unreadable images; -1 for padding."""
@@ -204,7 +204,7 @@ class Reading:
 
         A batch holds the next `batch_size` images, or fewer where the size changes. At most one
         thread reads video frames, because each thread would read the video from its beginning.
-        Remote images (`far`) get more threads, because most of these wait.
+        Remote images (`far`) get more threads, which mostly wait.
         """
         least = AT_ONCE if far and self.threads else 0
         threads = min(self.threads, 1) if has_frames else max(self.threads, least)
@@ -270,7 +270,7 @@ def training_batches(
         seed: seed of all random draws, together with the epoch and the step.
         epoch: index of the epoch, from 0.
         preprocessing: how images are resized; always to `image_size`, antialiased, as bytes.
-        steps: number of batches; None takes what the sampler draws, which is every place once.
+        steps: number of batches; None takes what the sampler draws: every place about once.
         start_step: the first batch to yield, to resume an interrupted epoch.
         part: (i, n) yields the i-th of n equal parts of every batch, for the i-th of n processes.
         on_bad_image: "stop" at an unreadable image, or "skip" it.

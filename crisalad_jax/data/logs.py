@@ -88,8 +88,8 @@ class _Frames(NamedTuple):
 class Log:
     """A robot log: its topics, the images of one, and the positions of another.
 
-    Stamps are nanoseconds since 1970: from the message's header or, if that has none, when it was
-    logged. Only headers stay in memory, and threads may share a log.
+    Stamps are nanoseconds since 1970: from the message's header or, if that has none, the time of
+    logging. Only headers stay in memory, and threads may share a log.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -133,7 +133,7 @@ class Log:
 
         Args:
             name: the topic's name, or "none". None takes the only one of NavSatFix or, without any
-                of that type, the only one of odometry or poses; a warning lists them if several.
+                of that type, the only one of odometry or poses; of several, a warning lists all.
 
         Raises:
             InputError: the log has no such topic, or it has no positions.
@@ -207,7 +207,7 @@ class Log:
     def positions(self, topic: str | None = None) -> Track | None:
         """Read positions over time; None if the log has none.
 
-        Messages without a fix, or with numbers that are not finite, are left out.
+        Messages without a fix, or with values that are not finite, are left out.
 
         Args:
             topic: see `position_topic`.
@@ -232,7 +232,7 @@ class Log:
         return Track(f"{self.path}#{name}", AXES[1 if is_fix else 2], times / 10**9, points)
 
     def scan(self, *topics: str) -> None:
-        """Read stamps and positions of all topics in one pass; later calls need no other.
+        """Read stamps and positions of topics in one pass; later calls reuse them.
 
         Raises:
             InputError: the log cannot be read.
@@ -270,7 +270,7 @@ class Log:
         if len(ordered) < len(stamps):
             warn(
                 f"{self.path}: left out {len(stamps) - len(ordered)} of {len(stamps)} images of "
-                f"{topic}, whose stamps are of earlier ones"
+                f"{topic}, whose stamps repeat earlier ones"
             )
         return ordered, numbers
 
@@ -347,7 +347,7 @@ def _reader(path: pathlib.Path) -> Iterator[Any]:
 
 @functools.cache
 def _typestore(is_ros1: bool) -> Any:
-    """Return the decoder of ROS 1 or ROS 2 messages; the common types are in all releases."""
+    """Return the decoder of ROS 1 or ROS 2 messages; all releases share the common types."""
     from rosbags.typesys import Stores, get_typestore
 
     if is_ros1:
@@ -423,10 +423,10 @@ def decode_message(
 
 
 def name_log_frame(frame: FrameName) -> pathlib.Path:
-    """Name a log's frame by its own stamp: the first at or after the frame's time.
+    """Name a log's frame by its actual stamp: the first at or after the frame's time.
 
     Returns:
-        The name. A time after the last frame stays, for the reader to report.
+        The name. A time after the last frame is unchanged, for the reader to report.
 
     Raises:
         InputError: the log cannot be read, or has no such topic.
@@ -445,7 +445,7 @@ class ListedFrames(NamedTuple):
     there: int
     """Number of all frames of the topic."""
     positions: Positions | None
-    """By path."""
+    """Positions by path; None if there are none."""
 
 
 def list_log_frames(
@@ -481,7 +481,7 @@ def list_log_frames(
     outside = len(chosen) - len(inside)
     warn(
         f"{path}: {place} has positions of {len(inside)} of {len(chosen)} images"
-        + (f", {outside} are outside of its time" if outside else "")
+        + (f", {outside} are outside its time" if outside else "")
         + (f"; the largest gap is {gaps[inside].max():.3g} s" if len(inside) else "")
     )
     of = {str(paths[i]): (float(points[i, 0]), float(points[i, 1])) for i in inside}

@@ -124,7 +124,7 @@ def comparable(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "po
 def on_ellipsoid(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "point 3"]:
     """Compute points in metres from the Earth's centre, whose distances are chords.
 
-    A chord of 1 km is 1 micrometre shorter than the distance on the ground, one of 1000 km 1 km.
+    Chords are shorter than distances on the ground: by 1 micrometre at 1 km, by 1 km at 1000 km.
     """
     phi, turn = np.deg2rad(latitude), np.deg2rad(longitude)
     radius = _EQUATOR / np.sqrt(1 - _SQUARE * np.sin(phi) ** 2)

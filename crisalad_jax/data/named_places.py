@@ -1,10 +1,10 @@
-"""Find training places in GSV-Cities, a folder or a table, or by position or order.
+"""Find training places in GSV-Cities, MSLS, a folder or a table, or by position or order.
 
 GSV-Cities (Ali-bey et al. 2022) has `Dataframes/{city}.csv` with one row per image, which is
 `Images/{city_id}/{city_id}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}.jpg`.
 
-Two images of a batch are never negatives if they are as close as two images of one place may be:
-places that are too close for that are listed as `near` each other, and never share a batch.
+Images as close as two images of one place may be must not be negatives: places this close are
+listed as `near` each other, and never share a batch.
 """
 
 import collections
@@ -42,7 +42,7 @@ _LAYOUTS = (
 )
 _GROUPED = "--place-radius METRES makes places by positions, --place-frames N of images in order"
 _VIEW = ("lat", "lon", "heading")
-"""Columns for where an image was taken."""
+"""Columns of an image's position and heading."""
 _APART = 4
 """Smallest distance between the centres of two places of a batch, in radii. Images of one place are
 at most two radii apart, and those of two places at least two."""
@@ -135,8 +135,8 @@ def _read_city(
         else:
             raise InputError(
                 f"{path}: line {line}: found no file Images/{city_id}/{stem}.jpg (nor .JPG, nor "
-                f"under Images/{path.stem}/), expected the images of all rows; --cities reads the "
-                "cities that it names alone"
+                f"under Images/{path.stem}/), expected the images of all rows; --cities reads "
+                "only the cities that it names"
             )
     if missing:
         warn(f"{path}: left out {missing} rows, whose images are missing")
@@ -223,7 +223,7 @@ def _read_table(
     places: dict[tuple[str, str], dict[str, View | None]] = collections.defaultdict(dict)
     missing = 0
     found = for_each(is_file, paths) if on_bad_image == "skip" else itertools.repeat(True)
-    for image, is_there, (name, row) in zip(paths, found, rows):  # noqa: B905, for it repeats
+    for image, is_there, (name, row) in zip(paths, found, rows):  # noqa: B905, `found` repeats
         place = row.text("city") if has_cities else "", row.text("place")
         if not is_there:
             missing += 1
@@ -286,7 +286,7 @@ def places_by_position(
 
 
 def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
-    """Make a place of each `frames` consecutive images of a folder or video, named after the first.
+    """Make each `frames` consecutive images of a folder or video a place, named after the first.
 
     Consecutive places of one folder or video are too close to share a batch.
     """

@@ -1,4 +1,4 @@
-"""Training places in GSV-Cities' or a custom layout, or made from positions or an order."""
+"""Training places from a layout such as GSV-Cities', or made by position or order."""
 
 import dataclasses
 import functools
@@ -166,7 +166,7 @@ def read_places(
         or (cities is not None and not has_cities)
     ):
         raise InputError(
-            f"{address_of(root)}: found arguments that do not fit each other, expected --cities "
+            f"{address_of(root)}: found conflicting arguments, expected --cities "
             "for the layout of GSV-Cities or MSLS; for other images --place-radius, perhaps with "
             "--positions, or --place-frames, and --fps or --topic with either"
         )

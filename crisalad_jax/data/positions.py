@@ -92,7 +92,7 @@ class Positions(NamedTuple):
                 raise InputError(
                     f"{source}: found {name!r} {away.max():.3g} degrees of longitude from the "
                     f"middle of zone {zone}, whose metres the map has, expected at most {_NEAR:g}; "
-                    "a new map of all images can have lat, lon"
+                    "a new map of all images can use lat, lon"
                 )
             fitted = np.round(zone.to_metres(latitude, longitude), 4)
         of = dict(zip(self.of, map(tuple, fitted.T.tolist()), strict=True))

@@ -20,8 +20,8 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, UInt8, UInt16
 
 PERCENTILES = (1, 99)
-"""Percentiles of an image's values, between which "contrast-stretch" spreads them. With the
-extremes, a dead pixel of a thermal camera would use up the range."""
+"""Percentiles of an image's values that "contrast-stretch" maps to 0 and 255. With the extremes
+instead, a dead pixel of a thermal camera would use up the range."""
 _NARROW = 2**14
 """Range of 16-bit values below which an image has fewer than 64 of 256 grey levels."""
 _noted = threading.Lock()

@@ -39,7 +39,7 @@ def is_remote(path: str | os.PathLike[str]) -> bool:
 
 
 def address_of(path: str | os.PathLike[str]) -> str:
-    """Return the address that a path stands for; other paths unchanged.
+    """Return the address that a path represents; other paths unchanged.
 
     Example:
         >>> address_of(pathlib.Path("s3://bucket/a.jpg"))
@@ -63,7 +63,7 @@ def check_address(path: str | os.PathLike[str]) -> None:
     if found is not None:
         raise InputError(
             f"{''.join(part or '' for part in found.groups())}: found a user or a query in the "
-            "address, expected none: fsspec's configuration can have passwords"
+            "address, expected none: fsspec's configuration can hold passwords"
         )
 
 
@@ -186,7 +186,7 @@ def _if_there(path: pathlib.Path, ask: Callable[[Any, str], _T]) -> _T | None:
 
 
 def for_each(work: Callable[[pathlib.Path], _T], paths: Sequence[pathlib.Path]) -> Iterable[_T]:
-    """Apply a function to files and return its results, with several at a time if remote."""
+    """Apply a function to files and return its results, several at a time if remote."""
     if not any(map(is_remote, paths)):
         return map(work, paths)
     with ThreadPoolExecutor(AT_ONCE) as threads:

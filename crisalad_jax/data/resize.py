@@ -44,7 +44,7 @@ def resize_image(
         antialias: whether the filter widens where the image shrinks. Without it "bicubic" is a
             little sharper, as in torch.
         pixels: "bytes" are rounded after each pass, as in Pillow; "floats" are neither rounded nor
-            clamped, and stay in the range of the image.
+            clamped nor rescaled.
 
     Returns:
         The image at that size, of uint8 or float32.
@@ -153,13 +153,13 @@ _FEW = 2**23
 
 
 class _Seen:
-    """Counts the values resampled so far."""
+    """A count of the values resampled so far."""
 
     values = 0
 
 
 def _resampler(values: int, once: bool) -> Callable[..., None]:
-    """Return the function that resamples the next values: numpy for the first few, or numba.
+    """Return the function that resamples the next values: numpy's for the first few, then numba's.
 
     Loading numba takes half a second, a third of the time from the start of a program to its first
     answer (docs/performance-studies.md). Without numba, numpy resamples all images.
@@ -181,7 +181,7 @@ def _resampler(values: int, once: bool) -> Callable[..., None]:
 def _machine_code(once: bool) -> Callable[..., None] | None:
     """Compile a loop that releases the GIL; None without numba.
 
-    Compiling takes about a second, and is cached in the `user_cache`, or in NUMBA_CACHE_DIR.
+    Compiling takes about a second; the result is cached in `user_cache` or NUMBA_CACHE_DIR.
     """
     try:
         import numba
@@ -291,8 +291,8 @@ def _step_floats(
 def _sums(values: np.ndarray, taps: _Taps, start: float = 0.0) -> np.ndarray:
     """Sum the weighted rows of each tap, a tap at a time; rows beyond the last have weight 0.
 
-    A product of two float32 is exact in float64, so that each sum is rounded once, to float32, as
-    by a processor's fused multiply-add.
+    A product of two float32 is exact in float64, so each sum is rounded once, to float32, as by a
+    processor's fused multiply-add.
     """
     first, _, weights = taps
     sums = np.full((len(first), *values.shape[1:]), start, np.float32)

@@ -88,7 +88,7 @@ class ImageSource(NamedTuple):
         return found if found.of else exif_positions(pictures)
 
     def spaced(self, positions: Positions, metres: float) -> Self:
-        """Leave out images that are closer than `metres` to the last one of their sequence.
+        """Leave out images closer than `metres` to the last remaining one of their sequence.
 
         A sequence is the images of a folder, or of a video, in order. Images without a position
         stay.
@@ -98,7 +98,7 @@ class ImageSource(NamedTuple):
             metres: the smallest distance between two images.
 
         Raises:
-            InputError: not a distance, or no image has a position.
+            InputError: `metres` is not a distance, or no image has a position.
         """
         if not 0 < metres < math.inf:
             raise InputError(f"--every-metres: found {metres:g}, expected metres above 0")
@@ -234,7 +234,7 @@ def join_sources(sources: Sequence[ImageSource]) -> ImageSource:
         return sources[0]
     far = [address_of(source.root) for source in sources if is_remote(source.root)]
     if far:
-        raise InputError(f"--images: found {', '.join(far)} of several, expected one source")
+        raise InputError(f"--images: found {', '.join(far)} among several sources, expected one")
     placed: dict[pathlib.Path, tuple[float, float] | None] = {}
     for source in sources:
         of = {} if source.positions is None else source.positions.of
@@ -261,12 +261,12 @@ class _Frames(NamedTuple):
     def of(
         self, found: Sequence[pathlib.Path], expected: str, on_bad_image: OnBadImage
     ) -> tuple[list[pathlib.Path], Positions | None]:
-        """Replace videos and logs by their frames, and name single frames by their own times.
+        """Replace videos and logs with their frames, and name single frames by their actual times.
 
         Under "skip", missing files stay in the list, to be skipped when they are read.
 
         Returns:
-            The images, and by path the positions that logs have of them.
+            The images, and the positions that logs have of them, by path.
         """
         paths: list[pathlib.Path] = []
         positions: Positions | None = None
@@ -295,7 +295,7 @@ class _Frames(NamedTuple):
             else:
                 paths.append(path)
         if self.fps is None and taken < there:
-            warn(f"{self.given}: {taken} of {there} frames, 1 per second: --fps")
+            warn(f"{self.given}: took {taken} of {there} frames, 1 per second (--fps)")
         return paths, positions
 
 
@@ -308,7 +308,7 @@ def _joined(
     if positions.axes != more.axes:
         raise InputError(
             f"{path}: found positions in {', '.join(more.axes)}, expected "
-            f"{', '.join(positions.axes)} as in the logs before it: --position-topic"
+            f"{', '.join(positions.axes)} as in the logs before it (--position-topic)"
         )
     return positions._replace(of=positions.of | more.of)
 
@@ -320,7 +320,7 @@ def check_frames(
     topic: str | None = None,
     position_topic: str | None = None,
 ) -> None:
-    """Check that options for choosing frames are given only if some image is such a frame.
+    """Check that options for choosing frames are given only if some image is a frame.
 
     Args:
         paths: the images of all sources.
@@ -406,7 +406,7 @@ def _listed(
     if not found or whole is not None:
         kind = "video" if whole is not None and is_video(whole) else "ROS bag"
         words = "no image" if whole is None else f"the {kind} {whole}"
-        raise InputError(f"{source}: found {words}, expected images, or frames as walk.mp4#t=12.5")
+        raise InputError(f"{source}: found {words}, expected images or frames like walk.mp4#t=12.5")
     try:
         paths, of_logs = frames.of(found, "an image file", on_bad_image)
     except InputError as error:
@@ -434,7 +434,7 @@ def _addresses(
         check_address(path)
     other = next((path for path in paths if not is_remote(path) or has_frames(path)), None)
     if other is not None:
-        raise InputError(f"{source}: found {other} with addresses, expected images at addresses")
+        raise InputError(f"{source}: found {other} among addresses, expected images at addresses")
     roots = sorted({pathlib.Path(*path.parts[:2]) for path in paths})
     if len(roots) > 1:
         raise InputError(

@@ -38,7 +38,7 @@ _SPELLINGS = {
 
 
 def number_of(text: str) -> float:
-    """Convert a text to a decimal number, or NaN if it is not one; `float` reads 1_0 as 10."""
+    """Convert a text to a decimal number, or NaN if it is not one; `float` would read 1_0 as 10."""
     plain = re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", text, re.ASCII | re.IGNORECASE)
     return float(text) if plain else math.nan
 
@@ -68,7 +68,7 @@ class Row(NamedTuple):
         return self.fields[column]
 
     def number(self, column: str) -> float:
-        """Return a finite number; with a point in it, commas mean thousands, and are refused.
+        """Return a finite number; a field with both a comma and a point is refused.
 
         Raises:
             InputError: the field is not a number, or is larger than a position can be.
@@ -99,7 +99,7 @@ class Table(NamedTuple):
             must: whether positions are required.
 
         Raises:
-            InputError: both pairs other than x,y; half a pair; or no pair although it is required.
+            InputError: both east,north and lat,lon; half a pair; or none although it is required.
         """
         # x and y may be anything, such as pixels, and count only if there is no other pair.
         begun = [axes for axes in AXES[:2] if set(axes) & set(self.columns)]
@@ -224,7 +224,7 @@ def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
 
 
 class Disk:
-    """Finds files by name, listing each folder once: a stat per file is slow on remote disks."""
+    """A finder of files that lists each folder once: a stat per file is slow on remote disks."""
 
     def __init__(self, root: pathlib.Path | None = None) -> None:
         """Start without listings, or with those of all folders below a remote root.

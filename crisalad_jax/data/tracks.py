@@ -1,7 +1,7 @@
 """Read tracks (positions over time): GPX 1.1 (Topografix), GeoJSON (RFC 7946) or a table.
 
-RFC 7946 has no times. They are read where togeojson writes them: `coordTimes`, also `times`, of a
-line, and `time` of a point.
+RFC 7946 defines no times. They are read from the properties that togeojson writes: `coordTimes` or
+`times` of a line, `time` or `timestamp` of a point.
 """
 
 import contextlib
@@ -94,8 +94,8 @@ def read_track(
 ) -> Track:
     """Read a track: GPX, GeoJSON, or a table with a column `time` and positions.
 
-    Times are ISO 8601, in UTC if they have no zone, or in tables also numbers since 1970: seconds,
-    milli-, micro- or nanoseconds, depending on their size.
+    Times are ISO 8601, in UTC if they have no zone, or numbers of seconds, milliseconds,
+    microseconds or nanoseconds since 1970, which are distinguished by their size.
 
     Args:
         path: the file. A .gpx has track points with times. A .geojson or .json has lines with
@@ -207,7 +207,7 @@ def _as_degrees(
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Builds XML trees without custom entities, which can expand to fill any memory."""
+    """A builder of XML trees without custom entities, which can expand to fill any memory."""
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         """Refuse a document type, which GPX does not have."""

@@ -1,7 +1,7 @@
 """Frames of video files, named as in `data.frames`: `walk.mp4#t=12.500`.
 
 Times are those in the file, so a variable frame rate does no harm. Every command names a frame by
-its own time in whole milliseconds, however a user wrote it: `frame_name` writes the name,
+its actual time in whole milliseconds, however a user wrote it: `frame_name` writes the name,
 `milliseconds_of` reads the time, `name_frame` finds the frame.
 """
 
@@ -66,13 +66,13 @@ def count_frames(video: str | os.PathLike[str]) -> int:
 
 
 def name_frame(frame: FrameName) -> pathlib.Path:
-    """Name a frame by its own time; between two frames, name the one that `read_frame` reads.
+    """Name a frame by its actual time; between two frames, name the one that `read_frame` reads.
 
     Args:
         frame: a frame of a video.
 
     Returns:
-        The name. A time after the video's last frame stays, for the reader to report.
+        The name. A time after the video's last frame is unchanged, for the reader to report.
 
     Raises:
         InputError: the video is missing or does not decode.
@@ -138,7 +138,7 @@ def _opened(video: str) -> cv2.VideoCapture:
 
 
 _lock = threading.Lock()
-"""Lock for all videos: two threads must not use OpenCV's at once."""
+"""Lock for all videos: two threads must not read with OpenCV at once."""
 
 
 def _video(path: str | os.PathLike[str]) -> _Video:
@@ -157,7 +157,7 @@ def _as_of(file: str, size: int, changed: int) -> _Video:
 def read_frame(frame: FrameName) -> UInt8[np.ndarray, "h w 3"]:
     """Read a frame as 8-bit RGB, upright: the first one at or after the time in its name.
 
-    Frames are read in order of time without seeking, so one thread should read a video.
+    Reading frames in order of time avoids seeking, so one thread should read a video.
 
     Raises:
         InputError: the file is not a video, or has no such frame.

@@ -1,4 +1,4 @@
-"""Calibration of a map: the similarity from which its answers reach a given precision."""
+"""Calibration of a map: the similarity threshold at which answers reach a given precision."""
 
 import datetime
 import math
@@ -34,11 +34,11 @@ def calibrate(
     verify: Verify | None = None,
     reading: Reading = Reading(),
 ) -> Calibration:
-    """Measure the similarity from which answers reach a precision, and store it in the map.
+    """Measure the similarity threshold at which answers reach a precision, and store it in the map.
 
     The set is evaluated with the map's model, image size and components, each image independently,
     as in `query`. The map's own images are not used. So the set's database should show the map's
-    places, or about as many similar ones, and its queries should be like those that the map will
+    places, or about as many similar places, and its queries should be like those that the map will
     get. Include queries of unknown places: they count as wrong when answered.
 
     Args:

@@ -63,7 +63,7 @@ def paired_difference(
     if not fits or (same_seeds and len(hits) != len(reference)):
         raise InputError(
             f"hits: found shapes {hits.shape} and {reference.shape}, expected (seeds, queries) of "
-            "the same queries, and as many seeds unless same_seeds=False"
+            "the same queries, and the same number of seeds unless same_seeds=False"
         )
     generator = np.random.default_rng(seed)
     queries = hits.shape[1]

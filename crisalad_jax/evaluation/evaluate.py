@@ -80,8 +80,8 @@ def evaluate(
         observe: called with the descriptors of each grouping's first seed; for bits, with unit
             vectors of the signs.
         rerank: a second stage; each grouping then has a result without and one with it.
-        precision: adds an `operating_point` to each result: the similarity from which first
-            retrievals are correct with this precision, and the recall that remains.
+        precision: adds an `operating_point` to each result: the similarity threshold at which first
+            retrievals reach this precision, and the recall that remains.
         reading: how images are read; its batch size is the number of images that attend to each
             other. With "skip" the results are for the set without unreadable images
             (`GroupingResult.skipped`).
@@ -124,7 +124,7 @@ def evaluate(
         if rerank.needs_model and rerank.model is None:
             if not isinstance(model, tuple):
                 raise InputError(
-                    "rerank: found another engine, expected separate weights (--rerank-weights)"
+                    "rerank: found no JAX model, expected separate weights (--rerank-weights)"
                 )
             rerank = dataclasses.replace(rerank, model=model)
     benchmark.ground_truth()  # fails before any work if there is none

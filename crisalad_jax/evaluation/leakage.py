@@ -62,8 +62,8 @@ def _sharing(owned: scipy.sparse.csr_array) -> SamePlace:
 def masked(batches: Batches, same: SamePlace) -> Batches:
     """Let each image attend only to those images of its batch that show other places.
 
-    Each image gets its own batch. In a shared batch with a mask, the second layer would still see
-    another image of its place through a third one.
+    Each image gets its own batch. In a shared batch with a mask, an image would still see others of
+    its place in the second layer, through a third image.
 
     Args:
         batches: batches without discarded slots.
@@ -86,8 +86,8 @@ def mirrored_share(
 
     This is the share of the other images in a query's batch that have a positive in the batch of
     the query's own positive; of several positives, the largest share counts. If the files of both
-    sides are in the same order it is 1: both batches hold the same places, and what they have in
-    common identifies the stretch of files. It is averaged over the queries with a positive that
+    sides are in the same order it is 1: both batches hold the same places, and what their images
+    share identifies that part of the sequence. It is averaged over the queries with a positive that
     attend to other images; None if there are none, or if no database image attends to another.
     """
     if "single" in (queries.grouping, database.grouping):
@@ -104,7 +104,7 @@ def mirrored_share(
 
 
 def _sight(batches: Batches) -> scipy.sparse.csr_array:
-    """Return which images each image sees, itself included, as a matrix of ones."""
+    """Return which images each image attends to, itself included, as a matrix of ones."""
     batch, place = np.nonzero(batches.kept)
     row, column = np.nonzero(batches.filled[batch])
     seen = batches.images[batch[row], column]

@@ -16,7 +16,7 @@ CONFIDENCE = 0.95
 
 
 class OperatingPoint(NamedTuple):
-    """Outcome of accepting first retrievals from some similarity on.
+    """Outcome of accepting first retrievals at or above some similarity.
 
     If no similarity reaches the requested precision, this is the point of highest precision, and
     `reached` is False.
@@ -71,7 +71,7 @@ def check_precision(precision: float) -> None:
     """Raise InputError unless a precision is above 0 and at most 1."""
     if not 0 < precision <= 1:
         raise InputError(
-            f"precision: found {precision}, expected a fraction above 0 and at most 1, as 0.99"
+            f"precision: found {precision}, expected a fraction above 0, at most 1, such as 0.99"
         )
 
 
@@ -150,7 +150,7 @@ _FEWEST = 3
 
 
 def check_supported(point: OperatingPoint, source: str) -> None:
-    """Check that a similarity does not rest on a coincidence; `caveats` says what it shows.
+    """Check that a similarity rests on enough answers; `caveats` says what it shows.
 
     Args:
         point: the operating point.
@@ -162,9 +162,9 @@ def check_supported(point: OperatingPoint, source: str) -> None:
     if point.answered < _FEWEST:
         raise InputError(
             f"precision: found {counted(point.answered, 'answer')} of similarity "
-            f"{point.min_similarity:.9g} or more on {source}, {point.right} right, which shows a "
+            f"{point.min_similarity:.9g} or more on {source}, {point.right} correct, which shows a "
             f"precision of at least {100 * point.lower_bound:.1f} % (95 % confidence), expected "
-            f"{_FEWEST} answers at least: more queries are needed, or the set is of another place"
+            f"at least {_FEWEST} answers: more queries are needed, or the set is of another place"
         )
 
 
@@ -174,7 +174,7 @@ def caveats(point: OperatingPoint) -> list[str]:
     Each caveat is at most one line, and starts in lower case so that it can follow a name.
     """
     asked = f"{100 * point.asked:g} %"
-    measured = f"{point.right} of {point.answered} answers were right"
+    measured = f"{point.right} of {point.answered} answers were correct"
     if not point.reached:
         return [
             f"no similarity reaches a precision of {asked}; the highest is "
@@ -188,5 +188,5 @@ def caveats(point: OperatingPoint) -> list[str]:
     )
     if point.right == point.answered and point.asked < 1:  # no number of queries shows 100 %
         enough = math.ceil(math.log(1 - CONFIDENCE) / math.log(point.asked))
-        sure += f"; {asked} takes {enough} answers, all of them right"
+        sure += f"; {asked} takes {enough} answers, all of them correct"
     return [sure]

@@ -39,7 +39,7 @@ class Protocol:
             if [*side] != sorted(side, key=str):
                 raise InputError(
                     f"grouping: found {PREFIX}{name} and images of {benchmark.name} in another "
-                    "order than that of their names, expected that order, as folders have it"
+                    "order than that of their names, expected that order, as in folders"
                 )
         return size
 
@@ -74,8 +74,8 @@ def check_groupings(texts: Sequence[str]) -> list[str]:
 def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
     """Make the groupings of an evaluation, in order and without repeats.
 
-    A published grouping is followed by single images and, in batches of the same size, random order
-    and no other images of the same place.
+    A published grouping is followed by single images, and by shuffled and masked batches of the
+    same size.
 
     Args:
         texts: each as `Grouping.parse` reads it, or `published:NAME` with a name in `PROTOCOLS`.
@@ -109,7 +109,7 @@ def protocol_notes(texts: Sequence[str]) -> list[str]:
     """Return the source of the batch sizes of each published grouping, one line each."""
     names = [text.removeprefix(PREFIX) for text in texts if text.startswith(PREFIX)]
     return [
-        f"{PREFIX}{name}: batches in the order of names, each side apart "
-        f"({PROTOCOLS[name].source}); below it the honest groupings of as many images."
+        f"{PREFIX}{name}: batches in the order of names, each side separately "
+        f"({PROTOCOLS[name].source}); below it, single, shuffled and masked ones of the same size."
         for name in dict.fromkeys(names)
     ]

@@ -15,9 +15,9 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import Grouping, grouping_words
 
 _RECALLS = (
-    "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
-    "AP: area under precision and recall of the first retrievals, by similarity. R at 100 % P: of "
-    "the queries with a positive, the share with a correct first retrieval above every wrong one."
+    "Percent of all queries; below, the 95 % bootstrap interval, as if queries were independent. "
+    "AP: area under the precision-recall curve of first retrievals, by similarity. R at 100 % P: "
+    "share of the queries with a positive whose correct first retrieval is above every wrong one."
 )
 
 
@@ -89,7 +89,7 @@ def evaluation_record(
 
 
 def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> list[str]:
-    """Explain a table of results as text, with a paragraph for each thing that it shows.
+    """Explain a table of results as text, with a paragraph for each topic.
 
     Args:
         results: what `evaluate` returned.
@@ -103,7 +103,7 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
     if any(skipped):
         notes.append(
             f"Unreadable and left out: {len(skipped.queries)} queries and {len(skipped.database)} "
-            "database images. All numbers are of the rest; a query whose positives were all left "
+            "database images. All results are for the rest; a query whose positives were all left "
             "out counts as a miss."
         )
     parsed = [Grouping.parse(each.grouping) for each in results if each.grouping != ANY]
@@ -112,17 +112,17 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
         sized = "; after @ a separate size" if any(each.batch_size for each in parsed) else ""
         notes.append(
             "A descriptor of this model depends on the images in its batch of "
-            f"{settings['batch_size']}{sized}: {grouping_words(kinds)}. Same place: of the others "
-            f"in sight, those that show the image's own place, by {settings['same_place']}. "
-            "Mirrored: of the others in a query's batch, those whose place is also in the batch of "
-            "its right answer. Of what both see a descriptor knows the stretch of files."
+            f"{settings['batch_size']}{sized}: {grouping_words(kinds)}. Same place: share of the "
+            f"others an image attends to that show its own place, by {settings['same_place']}. "
+            "Mirrored: share of the others in a query's batch whose place is also in its correct "
+            "answer's batch; what both batches show identifies that part of the sequence."
         )
         notes += protocol_notes(settings.get("groupings", ()))
     else:
         notes.append("No cross-image encoder: no descriptor depends on its batch.")
     if settings.get("dtype") == "bits":
         notes.append(
-            "Bits: descriptors are compared by their signs. With h of d bits that differ the "
+            "Bits: descriptors are compared by their signs. If h of d bits differ, the "
             "similarity is 1 - 2 h / d."
         )
     if "shuffled" in kinds and settings["seeds"] > 1:
@@ -132,15 +132,15 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
         )
     for label in dict.fromkeys(each.rerank for each in results if each.rerank is not None):
         notes.append(
-            f"+ {label}: the first {label.partition(':')[2]} retrievals by its scores, which stand "
-            "for similarities in AP and R at 100 % P."
+            f"+ {label}: the first {label.partition(':')[2]} retrievals by its scores, which "
+            "replace similarities in AP and R at 100 % P."
         )
     points = {each.label: each.operating_point for each in results if each.operating_point}
     if points:
         notes.append(
-            "Similarity to ask for: first retrievals from it on are right with the precision asked "
-            "for, on these queries, on which it was chosen. A query without a positive is an "
-            "unknown place, and wrong when answered. 95 % sure of: the lower bound of that "
+            "Similarity threshold: at or above it, first retrievals have the requested precision "
+            "on these queries, on which it was chosen. A query without a positive is an "
+            "unknown place, and wrong when answered. 95 % bound: the lower bound of that "
             "precision by Clopper and Pearson."
         )
         notes += [f"{name}: {words}." for name, point in points.items() for words in caveats(point)]

@@ -75,7 +75,7 @@ class GroupingResult(NamedTuple):
     mirrored_share: float | None = None
     """How closely a query's batch mirrors its correct answer's: `leakage.mirrored_share`."""
     over_single: Difference | None = None
-    """Recall@1 minus that of single-image descriptors; None for that row, or without it."""
+    """Recall@1 minus that of single-image descriptors; None for that row, or without one."""
     precision_recall: PrecisionRecall | None = None
     """The curve of the first seed; None if no query has a positive."""
     average_precision: float | None = None

@@ -51,7 +51,7 @@ class FirstSimilarities:
     """Observer for `evaluate` that stores the picture of the first grouping's similarities."""
 
     map: Float32[np.ndarray, "rows columns"] | None = None
-    """The picture by `similarity_map`; None before the first grouping is described."""
+    """The picture from `similarity_map`; None before the first grouping is described."""
 
     def __call__(
         self,

@@ -91,7 +91,7 @@ def adapt(
         folder: the map, whose images must be where they were indexed.
         out: folder for the run, the held-out pictures and `adapted.safetensors`.
         weights: the map's weights, if they were moved; None for the path that the map records.
-        images: more images of the place to train on, as `extract` takes them; they don't join the
+        images: more images of the environment, as `extract` takes them; they don't join the
             map.
         place_radius: metres from a place's centre within which its images lie, for a map with
             positions; None for 10.
@@ -147,7 +147,7 @@ def adapt(
             check_remakeable(folder)
         file = out / "adapted.safetensors"
         if file.exists() and read_header(file)["model_sha256"] == places.metadata.model:
-            raise InputError(f"{folder}: found the map made by {file} already; see adapted.json")
+            raise InputError(f"{folder}: found a map already rebuilt with {file}; see adapted.json")
         found = cast(Model, places.load_model(weights))
         _check_model(config, found, folder)
         model = Model(found.params, config.model)
@@ -181,7 +181,7 @@ def adapt(
         for copies in (CHOOSING, JUDGING)
     )
     start = _recall(model, judges, config, reading)
-    say(f"held-out frames: {config.monitor} {100 * start:.1f} before; validations ask other copies")
+    say(f"held-out frames: {config.monitor} {100 * start:.1f} before; validations use other copies")
     result = fit(
         config,
         with_repeats(split.training, config.images_per_place),
@@ -216,7 +216,7 @@ def adapt(
         name for name, (_, change) in gained.others.items() if round(-change.mean, 9) > most_lost
     ]
     if replace and lost:
-        say(f"{folder} stays: {', '.join(lost)} lost more than {100 * most_lost:g} (--most-lost)")
+        say(f"{folder} unchanged: {', '.join(lost)} lost over {100 * most_lost:g} (--most-lost)")
     if replace and gained.weights is not None and not lost:
         remake_map(folder, new, weights=gained.weights, reading=reading)
         gained = gained._replace(replaced=True)
@@ -230,7 +230,7 @@ def _check_model(config: TrainConfig, model: Model, folder: pathlib.Path) -> Non
     prepared = {name: getattr(model.config, name) for name in ("image_size", "preprocessing")}
     expected = dataclasses.replace(expected, **prepared)
     wrong = differences(config.model, expected)
-    require(not wrong, f"{folder}: the map's model is another: {'; '.join(wrong)}")
+    require(not wrong, f"{folder}: the map has another model: {'; '.join(wrong)}")
 
 
 def _more(
@@ -240,7 +240,7 @@ def _more(
     topic: str | None,
     reading: Reading,
 ) -> list[ImageSource]:
-    """List more images of a map's place, with positions in the map's axes and zone."""
+    """List more images of a map's environment, with positions in the map's axes and zone."""
     if not images:
         return []
     found = open_sources(images, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
@@ -272,7 +272,7 @@ def _recall(model: Model, benchmark: Benchmark, config: TrainConfig, reading: Re
 
 
 def to_json(found: Adapted) -> dict[str, Any]:
-    """Return what was gained as JSON values by name."""
+    """Convert the gain to JSON values by name."""
     before, after = found.held_out
     others = {
         name: {"before": recall, "change": change.mean, "interval": list(change.interval)}

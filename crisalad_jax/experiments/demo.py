@@ -37,7 +37,7 @@ from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
 GROUPINGS = ("single", "shuffled", "sequential")
-"""The groupings; without window, because rendered places have no order in time."""
+"""The groupings; not window, because rendered places have no order in time."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -117,7 +117,7 @@ def distil(
         source = group_images(join_sources(listed))
     how: Any = {"on_bad_image": skip, "quiet": reading.quiet}
     sets: Any = {"validation": validation, "validation_images": validation_images}
-    sets |= frames if images is None else {}  # which `read_places` refuses
+    sets |= frames if images is None else {}  # for `read_places` to reject
     places, benchmark, initial = read_inputs(config, source, out, weights=weights, **sets, **how)
     assert isinstance(places, Places)
     count, batch = len(places.names), config.places_per_batch

@@ -26,11 +26,11 @@ SHARE, MOST = 0.2, 100
 """Share of a map's images that is held out, and their maximum number."""
 CHOOSING, JUDGING = range(2), range(2, 4)
 """Augmented copies of a held-out image that stop the training, and those that measure the gain:
-the best of several validations is too high."""
+the best of several validations is biased upwards."""
 
 
 class Split(NamedTuple):
-    """The images of a map, and more of its place, after the split."""
+    """The images of a map, and more of its environment, after the split."""
 
     source: ImageSource
     """All images, those of the map first."""
@@ -54,10 +54,10 @@ def split_images(
     """Hold out some of a map's images, and group the rest into places.
 
     Args:
-        sources: the map's images, and more of its place.
+        sources: the map's images, and more of its environment.
         seed: seed that draws the held-out images.
         place_radius: metres within which images show the same place.
-        place_frames: number of consecutive images that show it; without both each image is a place.
+        place_frames: number of consecutive images of a place; without either, each image is one.
 
     Raises:
         InputError: the map has one image, or no place is left.
@@ -145,7 +145,7 @@ def held_out_benchmark(
     """Write augmented copies of the held-out images, and make the set in which they query the map.
 
     Args:
-        config: the run's; its augmentation changes the copies as it changes training images.
+        config: the run's configuration; the copies are augmented as training images are.
         split: the images.
         folder: where the copies are written.
         copies: numbers of the copies of each image, which seed the augmentation.

@@ -156,7 +156,7 @@ def _validation(run: _Run) -> Iterator[_Row]:
     if not validations:
         return
     last = run.weights.name == WEIGHTS[1]
-    # Of equal recalls, the first counts as the best; the last weights belong to the last one.
+    # Of equal recalls, the first is the best; the last weights belong to the last validation.
     best = max(validations, key=lambda each: sum(each[rank] for rank in ranks))
     chosen = validations[-1] if last else best
     recalls = {name: value for name, value in chosen.items() if re.fullmatch(r"R@\d+", name)}
@@ -242,8 +242,8 @@ def _table(rows: Sequence[_Row]) -> str:
     table = Table(["data set", "grouping", *names], cells, labels=2).markdown()
     return (
         f"{table}\nPercent of all queries; in brackets the 95 % interval by bootstrap over the "
-        "queries, as if they were independent. A validation chose the weights: its recalls are "
-        "high by that."
+        "queries, as if they were independent. A validation chose the weights, so its recalls "
+        "are optimistic."
     )
 
 

@@ -46,11 +46,11 @@ _Colour = tuple[int, int, int]
 def record(
     path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = None
 ) -> Iterator["Recording"]:
-    """Write a recording, which gets its name once it is complete, also after a signal.
+    """Write a recording, which appears at `path` once it is complete, even after a signal.
 
     Args:
         path: the file, `.rrd`.
-        root: folder of the map's images; None for where they were. Missing images are left out,
+        root: folder of the map's images; None is the original one. Missing images are left out,
             with a warning.
 
     Raises:
@@ -123,7 +123,7 @@ class Recording:
         Args:
             answers: what `query` found; each label belongs to one map.
             images: pixels of the queries; None reads their files.
-            right: whether each first answer is correct; None for whether the place is known.
+            right: whether each first answer is correct; None treats known places as correct.
             label: first part of the names of these entities, such as a grouping; "" for none.
 
         Raises:
@@ -179,8 +179,8 @@ class Recording:
         if self._lost:
             first = next(iter(self._lost.values()))
             warn(
-                f"{counted(len(self._lost), 'picture')} left out, as of {first}; --map-images "
-                "(root=) says where else"
+                f"{counted(len(self._lost), 'picture')} left out (first: {first}); --map-images "
+                "(root=) sets another folder"
             )
         views = [scene.finish() for scene in self._scenes.values()]
         if views:

@@ -72,12 +72,12 @@ def _points(difference: float) -> str:
 
 
 def points_table(points: Mapping[str, OperatingPoint], asked: str = "similarity") -> Table:
-    """Make a table of operating points by name: what to ask for, and what that yields."""
+    """Make a table of operating points by name: the threshold, and its precision and recall."""
     names = (
-        f"{asked}\nto ask for",
-        "precision\n95 % sure of",
+        f"{asked}\nthreshold",
+        "precision,\n95 % bound",
         "recall left,\nof all queries",
-        "right of\nanswered",
+        "correct of\nanswered",
         "unknown places\nanswered",
     )
     rows = []

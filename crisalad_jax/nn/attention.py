@@ -54,7 +54,7 @@ class Rotation(NamedTuple):
 
 
 def init_torch_attention(qkv_key: PRNGKeyArray, proj_key: PRNGKeyArray, dim: int) -> Attention:
-    """Draw parameters like torch's `nn.MultiheadAttention`: Glorot-uniform inputs, zero biases."""
+    """Draw parameters like torch's `nn.MultiheadAttention`: Glorot-uniform qkv, zero biases."""
     bound = math.sqrt(6 / (dim + 3 * dim))
     qkv = random_init.uniform(qkv_key, (dim, 3 * dim), minval=-bound, maxval=bound)
     proj = init_linear(proj_key, dim, dim).weight

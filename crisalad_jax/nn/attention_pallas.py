@@ -22,15 +22,15 @@ from jaxtyping import Array, Float
 _LANES = 128
 """Values in a row of a vector register: heads are read that many values at a time."""
 _WIDTH = 512
-"""Maximum values of each token, over all heads, that a kernel step reads: fewer steps wait less."""
+"""Maximum number of values per token and step, all heads together: wide steps wait less."""
 _PIECES = 12
-"""Maximum score products that a step is unrolled into: more take minutes to compile. A step has at
-least one unit of lanes."""
+"""Maximum number of score products that a step is unrolled into: more take minutes to compile. A
+step has at least one unit of lanes."""
 _ROWS = 384
-"""Maximum queries whose scores are computed at a time."""
+"""Maximum number of queries whose scores are computed at a time."""
 _TOKENS = {jnp.dtype(jnp.bfloat16): 2048, jnp.dtype(jnp.float32): 640}
-"""Maximum tokens by type: their scores for `_ROWS` queries are 3 MiB. In float32, more tokens take
-minutes to compile."""
+"""Maximum number of tokens by type: their scores for `_ROWS` queries are 3 MiB. In float32, more
+tokens take minutes to compile."""
 _MEMORY = 2**26
 """Bytes of a chip's vector memory that a kernel may use: half of the smallest chip's since v5e."""
 

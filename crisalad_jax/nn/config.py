@@ -68,8 +68,8 @@ class ModelConfig:
         several = request.levels not in (None, (backbone.depth,))
         for has, is_asked, what in (
             (backbone.class_token, request.class_token, "a class token"),
-            (attends, request.class_attention, "a class token that attends to patches, as vit's"),
-            (attends, request.facet != "token", "facets of attention, as vit's"),
+            (attends, request.class_attention, "a class token that attends to patches, like vit's"),
+            (attends, request.facet != "token", "facets of attention, like vit's"),
             (inserts, request.insertion is not None, "blocks that take tokens, such as vit"),
             (backbone.exposes_levels, several, "features of other blocks than the last"),
             (backbone.side_paths > request.path, True, "adapters on two side paths"),
@@ -93,7 +93,7 @@ class ModelConfig:
             return
         require(
             self.aggregator.trainable,
-            f"cross_image: found {encoder.part_name} for {aggregator}, with which nothing trains, "
+            f"cross_image: found {encoder.part_name} for {aggregator}, which cannot be trained, "
             "expected none",
         )
         whole, cuts = encoder.global_token, encoder.width is not None
@@ -201,7 +201,7 @@ class ModelConfig:
 
         Args:
             image_size: height and width in pixels; None keeps the model's own.
-            resize: values of `preprocessing.WORDS`, such as "bicubic"; none keep the model's own.
+            resize: values of `preprocessing.WORDS`, such as "bicubic"; empty keeps the model's own.
 
         Returns:
             The configuration, for the same parameters.
@@ -257,8 +257,8 @@ def check_unit_length(model: ModelConfig, name: str) -> None:
     """
     require(
         model.unit_length,
-        f"{name}: found a model whose projection leaves lengths as they are, expected one that "
-        "makes unit vectors, which are compared by cosine",
+        f"{name}: found a model whose descriptors are not unit vectors, expected unit vectors, "
+        "which are compared by cosine",
     )
 
 

@@ -138,13 +138,13 @@ class TransformerEncoder(CrossImage):
 
     def check(self, dim: int) -> None:
         """Require a number of heads that divides the width of a token."""
-        words = f"a divisor of the {dim} numbers of a token"
+        words = f"a divisor of the {dim} dimensions of a token"
         require_field(self, "heads", dim % self.heads == 0, words)
 
     def init(self, key: PRNGKeyArray, dim: int) -> Any:
         """Draw parameters as torch does: Glorot-uniform attention, zero biases, default linears.
 
-        All layers start equal, because torch's `nn.TransformerEncoder` copies the layer it gets.
+        All layers start identical: torch's `nn.TransformerEncoder` copies the layer it gets.
         """
         # Drawn separately: a training step that donates its buffers must not get one twice.
         layers = (init_encoder_layer(key, dim, self.feedforward) for _ in range(self.layers))

@@ -17,7 +17,7 @@ def diff_trees(found: Any, expected: Any, dtypes: Collection[Any] = ()) -> list[
         dtypes: types that a leaf may have instead of the expected one.
 
     Returns:
-        A text for each difference; none if the trees match.
+        A string for each difference; empty if the trees match.
 
     Example:
         >>> import numpy as np

@@ -128,7 +128,7 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
 
     Raises:
         InputError: they do not match, and the first differences are listed; or the model computes
-            in float64 outside of JAX's 64-bit mode.
+            in float64 outside JAX's 64-bit mode.
 
     Example:
         >>> import jax
@@ -169,11 +169,11 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     rounded to float32.
 
     Args:
-        params: the parameters, or a tree of these with some left out.
+        params: the parameters, or a tree with some of them left out.
         config: the model's configuration.
 
     Returns:
-        Parameters that `describe` accepts as well. In float32 they are `params` itself.
+        Parameters that `describe` accepts as well. In float32, `params` itself.
 
     Example:
         >>> import jax
@@ -229,9 +229,9 @@ def merge_adapters(model: Model) -> Model:
 
 
 def _of_images(function: _F) -> _F:
-    """Let a compiled function of images know which devices they are on.
+    """Pass the devices of the images to a compiled function of images.
 
-    Pixel values, which a trace does not know, are checked before the call.
+    Pixel values are unknown during tracing, so they are checked before the call.
     """
     spread = over_images("images", 1)(function)
 
@@ -269,8 +269,8 @@ def describe(
     Args:
         params: parameters from `init_crisalad` or a weight file.
         images: 8-bit pixels, which are normalised here as `config.preprocessing` says, or floats
-            that already are (float pixels from 0 to 1 or 0 to 255 are rejected). The sides may be
-            any that the backbone accepts, not only `config.image_size`. See `prepare_image`.
+            that are already normalised (float pixels from 0 to 1 or 0 to 255 are rejected). Sides
+            may be any that the backbone accepts, not only `config.image_size`. See `prepare_image`.
         config: the model's configuration; static.
         mask: which images attend to which.
         key: a `jax.random.key` for dropout; None means inference.
@@ -346,12 +346,12 @@ def tokens_and_statistics(
     key: Key[Array, ""] | None = None,
     micro_batch: int | None = None,
 ) -> tuple[Tokens, Crisalad | None]:
-    """Extract tokens while tracing, in training with the statistics of the batch.
+    """Extract tokens while tracing, and update the running statistics in training.
 
-    If the backbone has batch norms, they normalise by the mean and variance of the batch's valid
-    images, like torch in training mode, so a token depends on the other images. Devices that share
-    a batch share its statistics. Each micro-batch is a separate forward pass: it has its own
-    statistics, and updates the running ones in turn.
+    With `valid`, batch norms normalise by the mean and variance of the batch's valid images, like
+    torch in training mode, so a token depends on the other images. Devices that share a batch share
+    its statistics. Each micro-batch is a separate forward pass: it has its own statistics, and
+    updates the running ones in turn.
 
     Args:
         params: see `describe`.
@@ -690,7 +690,7 @@ def cross_image_attention(
 
     Entry (i, j) is the weight of image j's token for the same token of image i; rows sum to 1. The
     tokens are the pieces of the global token, then the clusters; or the pieces of the descriptor,
-    if the encoder cuts that.
+    if the encoder cuts it.
 
     Args:
         params: see `describe`.
@@ -739,7 +739,7 @@ def describe_training_batch(
         measured: images that batch norms take their statistics from; None uses the stored ones.
         key: random key for dropout; None means no dropout.
         micro_batch: see `extract_tokens`.
-        sub_batches: sizes of consecutive groups whose images attend to each other; by default one.
+        sub_batches: sizes of groups of consecutive images that attend to each other; empty for one.
 
     Returns:
         (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them. The

@@ -23,7 +23,7 @@ def product_precision(dtype: Any) -> jax.lax.Precision | None:
 
 
 def rule_precision(dtype: Any) -> str | None:
-    """Return the products' precision, for rules whose backward half is traced outside its scope."""
+    """Return the products' precision, for rules whose backward pass is traced outside its scope."""
     if product_precision(dtype) is not None:
         return "default"
     return None if target().platform == "cpu" else jax.config.jax_default_matmul_precision  # pyright: ignore
@@ -173,8 +173,8 @@ def _with_wide_gradient(
 ) -> Array:
     """Compute product(x, weight); on accelerators, sum a wider weight's gradient in its type.
 
-    JAX's rule rounds it to bfloat16 before the sum over devices. A CPU's devices are virtual and
-    do without this, so that its program stays the same.
+    JAX's rule rounds it to bfloat16 before the sum over devices. A CPU's devices are virtual, so
+    its program does without this.
     """
     if x.dtype != jnp.bfloat16 or weight.dtype == x.dtype or target().platform == "cpu":
         return product(x, weight)

@@ -39,7 +39,7 @@ def _bits_from(data: Array, bit_width: int, shape: Shape) -> Array:
 
 
 def _only_draws(*_: Any) -> Array:
-    raise NotImplementedError("a key with a place draws, and is not split")
+    raise NotImplementedError("a key of `_at_a_place` can only draw")
 
 
 _at_a_place = define_prng_impl(
@@ -103,7 +103,7 @@ def truncated_normal(
 
 
 def split(key: PRNGKeyArray, num: int = 2) -> list[PRNGKeyArray]:
-    """Split a key as `jax.random.split` does, with one program for every `num`."""
+    """Split a key as `jax.random.split` does, with the same program for every `num`."""
     return list(jax.random.split(key, max(num, _MOST_KEYS)))[:num]
 
 

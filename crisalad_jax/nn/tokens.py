@@ -48,7 +48,7 @@ class Tokens(NamedTuple):
 
 
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "*batch token dim"]:
-    """Return the local tokens, after the global one cut to their width if it takes part."""
+    """Return the local tokens; if the global one takes part, it comes first, cut to their width."""
     if not global_token:
         return tokens.local
     *batch, _, dim = tokens.local.shape
@@ -59,7 +59,7 @@ def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "*batch t
 def from_sequence(
     sequence: Float[Array, "*batch token dim"], before: Tokens, *, global_token: bool
 ) -> Tokens:
-    """Undo `as_sequence`; a global token that took no part is taken from `before`."""
+    """Undo `as_sequence`; a global token that took no part comes from `before`."""
     if not global_token:
         return Tokens(before.global_token, sequence)
     pieces = sequence.shape[-2] - before.local.shape[-2]

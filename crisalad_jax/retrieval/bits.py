@@ -35,8 +35,8 @@ _PIECE = 2**16
 def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8"]:
     """Pack the signs of descriptors: a bit is 1 where a value is at least 0.
 
-    The first dimension is the highest bit of the first byte, as in `numpy.packbits`. Mapping 0 to 1
-    is the rule of SelaVPR++; TeTRA maps 0 to 0, and all other values the same way.
+    The first dimension is the highest bit of the first byte, as in `numpy.packbits`. A value of 0
+    becomes 1, as in SelaVPR++; TeTRA differs only in that it becomes 0.
 
     Args:
         descriptors: descriptors of the n images, of any norm; d is a multiple of 8.
@@ -74,11 +74,11 @@ def _packed(array: np.ndarray, name: str, length: int | None = None) -> Bits:
 
 def check_packable(length: int, name: str) -> None:
     """Raise InputError if descriptors of this many dimensions do not fill whole bytes."""
-    require(length % 8 == 0, f"{name}: found {length} numbers, expected a multiple of 8 as bits")
+    require(length % 8 == 0, f"{name}: found {length} dimensions, expected a multiple of 8 as bits")
 
 
 def sign_vectors(bits: Bits) -> Float32[np.ndarray, "n d"]:
-    """Unpack bits to unit vectors with values of one size, whose cosines are the similarities."""
+    """Unpack bits to unit vectors of values +v and -v, whose cosines are the similarities."""
     size = np.float32(1 / np.sqrt(8 * bits.shape[1]))
     return np.where(np.unpackbits(bits, axis=1), size, -size)
 
@@ -95,7 +95,7 @@ def as_bits(array: np.ndarray, name: str, length: int | None = None) -> Bits:
     if array.dtype != BITS or not fits:
         raise InputError(
             f"{name}: found {array.dtype} {array.shape}, expected packed bits, uint8 of shape "
-            f"(images, {expected}), neither zero"
+            f"(images, {expected}), both above 0"
         )
     return array
 

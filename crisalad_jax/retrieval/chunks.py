@@ -27,7 +27,7 @@ _SCATTERED = 4
 
 
 def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descriptors:
-    """View an array as a matrix of descriptors, after checking it, and its length if given.
+    """Check that an array is a matrix of descriptors, of `length` if given, and return a view.
 
     NumPy has no name for bfloat16: a .npy file stores it as two untyped bytes ("V2").
 
@@ -44,7 +44,7 @@ def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descript
     if array.ndim != 2 or 0 in array.shape or length not in (None, array.shape[1]):
         raise InputError(
             f"{name}: found shape {array.shape}, expected (images, {length or 'descriptor'}), "
-            "neither zero"
+            "both above 0"
         )
     return array
 
@@ -88,7 +88,7 @@ def blocks(
     places: Int[np.ndarray, " m"] | None = None,
     narrow: bool = False,
 ) -> Generator[Block, None, None]:
-    """Yield the rows of an array in order, `size` at a time, checked, and if possible uncopied.
+    """Check and yield the rows of an array in order, `size` at a time, if possible uncopied.
 
     Pages of a memory map are released after the next block is taken, so a stream may be read one
     block ahead.
@@ -140,7 +140,7 @@ def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
 def regrouped(parts: Iterable[Descriptors], size: int) -> Generator[Block, None, None]:
     """Regroup consecutive arrays into blocks of about `size` rows, at most twice as many."""
     pieces = (
-        Block(0, part[start : start + size])  # `joined` counts
+        Block(0, part[start : start + size])  # `joined` sets the starts
         for part in parts
         for start in range(0, len(part), size)
     )

@@ -44,7 +44,7 @@ class Described(NamedTuple):
 
 
 def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image") -> Pixels:
-    """Resize an image as a model's configuration says, and normalise it if it is float.
+    """Resize an image as a model expects it, and normalise it unless the model takes bytes.
 
     Args:
         image: 8-bit RGB, from `read_image`; or grey (height, width) or (height, width, 1), which is
@@ -94,8 +94,8 @@ def describe_files(
 ) -> Float32[np.ndarray, "image descriptor"]:
     """Describe image files, each independently of the others.
 
-    Files are decoded upright and resized according to the model's configuration; a descriptor
-    depends on nothing else. `extract` does the same for folders, and writes files.
+    Files are decoded upright and resized according to the model's configuration. `extract` does the
+    same for folders, and writes files.
 
     Args:
         model: a model from `load`, or a `Runtime`.
@@ -129,8 +129,8 @@ def describe_images(
 ) -> Float32[np.ndarray, "image descriptor"]:
     """Describe images in memory, each independently of the others.
 
-    A batch is padded to a power of two, so that few programs are compiled and a single image costs
-    one. Values differ from those of `describe_files` by rounding, as batch sizes differ.
+    Batches are padded to powers of two, so few programs are compiled, and a single image is not
+    padded. Values differ from those of `describe_files` by rounding, as batch sizes differ.
 
     Args:
         model: a model from `load`, or a `Runtime`.
@@ -199,9 +199,9 @@ def described(
     """Describe images in order, each with the `window - 1` before it, and yield batch by batch.
 
     The descriptors are those of the grouping `window`, or `single` if the window is 1, of the
-    images that could be read. Memory holds two batches, and the images that are read ahead.
-    Components reduce whole batches, so that the bits of a descriptor do not depend on which other
-    images could be read.
+    images that could be read. Memory holds two batches, and the images that are read ahead. With a
+    window of 1, components reduce whole batches, so that the bits of a descriptor do not depend on
+    which other images could be read.
 
     Raises:
         InputError: an image cannot be read and `reading` says "stop"; or what
@@ -303,7 +303,7 @@ class TokenSet:
         self._describer, self._reading, self._label = describer, reading, label
 
     def batches(self, grouping: str, batch_size: int | None, seed: int = 0) -> Batches:
-        """Group the readable images; by default in the batches in which they were read."""
+        """Group the readable images; the default batch size is the one they were read in."""
         size = batch_size or self._reading.batch_size
         return batches_of(len(self.rows), grouping, size, seed)
 
@@ -343,7 +343,7 @@ def grouped(
         quiet: whether to hide the progress bar.
     """
     count, size = batches.images.shape
-    # Batches that give one descriptor are computed together, as many as each has images.
+    # Batches of one descriptor each are computed together, as many as a batch has images.
     gives_one = batches.grouping in ("window", MASKED)
     step = max(1, min(size, count - first)) if gives_one else 1
     # The other groupings take little time compared with the backbone, and need no bar.
@@ -361,7 +361,7 @@ def grouped(
 
 
 class FrameDescriber:
-    """Describe images as they arrive, each with the `window - 1` before it."""
+    """A describer of images as they arrive, each with the `window - 1` before it."""
 
     def __init__(self, describer: Describer, window: int = 1) -> None:
         """Start without an image.
@@ -373,7 +373,7 @@ class FrameDescriber:
         # An engine's configuration needs JAX, which takes a second to import.
         attends = window == 1 or describer.config.cross_image.attends
         if window < 1 or not attends:
-            expected = "at least 1" if attends else "1 of a model without a cross-image encoder"
+            expected = "at least 1" if attends else "1 for a model without a cross-image encoder"
             raise InputError(f"window: found {window}, expected {expected}")
         self._describer, self._window = describer, window
         self.forget()
@@ -398,5 +398,5 @@ class FrameDescriber:
         return group(self._describer, held, batches, first=first)[first:]
 
     def forget(self) -> None:
-        """Start again without an image."""
+        """Forget all images so far."""
         self._before: list[Rows] = []

@@ -55,7 +55,7 @@ class Describer(Protocol):
 def describer_of(
     model: "Model | Runtime | Describer", groupings: Sequence[str] = ("single",)
 ) -> Describer:
-    """Return a describer for a model, and check it.
+    """Check a model, and return a describer for it.
 
     Args:
         model: parameters and configuration, or a model in another engine.

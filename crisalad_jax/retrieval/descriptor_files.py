@@ -239,8 +239,8 @@ def _check_files(path: pathlib.Path, roles: Sequence[str]) -> None:
         if not isinstance(digests, dict) or digests.get(role) != sha256_of(files[role]):
             raise InputError(
                 f"{files[role]}: found other bytes than {record.name} says, expected those that "
-                "were written together: they were changed, or an extraction ended between the two; "
-                "the same command finishes it"
+                "were written together: one was changed, or an extraction was killed between the "
+                "two; the same command finishes it"
             )
 
 

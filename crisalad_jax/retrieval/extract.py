@@ -109,7 +109,7 @@ def extract(
         grouping: one of `GROUPINGS`: which images attend to each other.
         seed: random seed of the order in the grouping "shuffled".
         root: folder that names are relative to; by default the folder `images`, or that of another
-            source. Files of a list keep their names.
+            source. Without a root, files of a list are named by their paths.
         pca: components that reduce the descriptors, or a file of them.
         verify: whether to check `pca` against its checksum.
         reading: how images are read.
@@ -265,16 +265,16 @@ class _Work:
         return segments, skipped
 
     def _reusable(self, folder: pathlib.Path, digest: str) -> Segments:
-        """Open the stored rows if they are complete and from this work; otherwise remove them."""
+        """Open the stored rows if they are complete and of this extraction, else remove them."""
         try:
             segments = self.opened(folder)
             segments.verify()
             if all(record.get("work") == digest for record in segments.records):
                 return segments
-            reason = f"{folder}: found work of another model, batch size or images"
+            reason = f"{folder}: found results for another model, batch size or images"
         except InputError as error:
             reason = str(error)
-        warn(f"{reason}; the work in this folder starts again")
+        warn(f"{reason}; starting again from the first image")
         _remove_work(folder)
         return self.opened(folder)
 
@@ -307,7 +307,7 @@ class _Work:
 
 @contextlib.contextmanager
 def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
-    """Hold the folder of unfinished descriptors of `out`; remove it after success.
+    """Lock the folder of unfinished descriptors of `out`; remove it after success.
 
     An error leaves it only if it holds work, and the message then says so. Without `out`, the
     folder is temporary.
@@ -330,7 +330,7 @@ def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
                 _remove_work(folder)
             elif isinstance(error, InputError):
                 raise InputError(
-                    f"{error} (what is done is stored in {folder}: the same command resumes)"
+                    f"{error} (finished work is stored in {folder}: the same command resumes)"
                 ) from error
             raise
         _remove_work(folder)
@@ -370,7 +370,7 @@ def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
 
 
 def _made(describer: Describer, components: Pca | None) -> dict[str, str | None]:
-    """Return the hashes of what made the descriptors; only equal ones can be compared."""
+    """Return hashes of what made the descriptors; only those with equal hashes are comparable."""
     return {
         MADE_BY: describer.digest,
         "pca_sha256": None if components is None else pca_hash(components),

@@ -2,8 +2,8 @@
 
 A graph (HNSW: Malkov and Yashunin, 2018) stores the descriptors as they are and finds nearly all
 neighbours. IVF-RaBitQ (Gao and Long, 2024) stores one bit per dimension, and compares the bits in
-the lists nearest to a query; exact similarities then rank the results. `recall_against_exact`
-measures what either misses. Reduce descriptors of thousands of dimensions first (`pca`).
+the lists nearest to a query; rank its results again by exact similarities. `recall_against_exact`
+measures the share that either finds. Reduce descriptors of thousands of dimensions first (`pca`).
 """
 
 import hashlib
@@ -30,7 +30,7 @@ faiss: Any = _faiss  # its classes are created at import
 Kind = Literal["hnsw", "ivf-rabitq"]
 KINDS: dict[str, None] = dict.fromkeys(get_args(Kind))
 """A graph over the unchanged descriptors, nearly exact and as large as they are; or lists of their
-signs, a 27th of the size at 512 dimensions, whose results should be ranked again."""
+signs, 80 bytes each for 512 dimensions, whose results should be ranked again."""
 _LINKS = 32
 """Number of links of a vector in each layer of the graph; twice as many in the lowest. FAISS
 recommends 4 to 64 and the paper 5 to 48, with more for longer vectors."""
@@ -124,7 +124,7 @@ class Index(NamedTuple):
                 bar.advance(len(part))
 
     def has_room_for(self, count: int) -> bool:
-        """Return whether an index built for `count` descriptors has at most twice as many lists."""
+        """Return whether an index of `count` descriptors would have at most twice as many lists."""
         index = self.faiss_index
         return self.kind == "hnsw" or 2 * _lists(index).nlist >= _list_count(count, index.d)
 
@@ -253,8 +253,8 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
     kind = kinds.get((type(index), type(inner)))
     if kind is None or index.metric_type != faiss.METRIC_INNER_PRODUCT:
         raise InputError(
-            f"{path}: found a {type(inner).__name__}, expected one of inner products, as `build` "
-            "makes it"
+            f"{path}: found a {type(inner).__name__}, expected an index by inner product, from "
+            "`build`"
         )
     return Index(kind, index)
 

@@ -18,14 +18,14 @@ GROUPINGS = {
     "single": "each image independently",
     "shuffled": "batches of images in random order",
     "sequential": "batches of images in file order: neighbours help each other",
-    "window": "every image with those just before it in file order: what a moving camera has",
+    "window": "every image with those just before it in file order, as from a moving camera",
 }
 """Groupings of the images of one side, queries or database. The two sides never mix."""
 
 MASKED = "masked"
-"""The batches of `sequential`, in which an image does not attend to others of its own place. It
+"""The batches of `sequential`, in which an image does not attend to others of the same place. This
 needs the ground truth, so only an evaluation can use it."""
-_WORDS = GROUPINGS | {MASKED: "as sequential, but no image sees another of its own place"}
+_WORDS = GROUPINGS | {MASKED: "as sequential, but no image sees another of the same place"}
 
 DEFAULT_GROUPINGS = ("single", "shuffled", "sequential", "window/single")
 """The last is for a robot, with its latest frames and a map of images described independently."""
@@ -43,7 +43,7 @@ class Grouping:
     queries: str
     database: str
     batch_size: int | None = None
-    """Images that attend to each other; None is the batch size in which images are read."""
+    """Number of images that attend to each other; None is the batch size for reading images."""
 
     @classmethod
     def parse(cls, text: str) -> "Grouping":
@@ -135,9 +135,9 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
     mask would not work: over several layers, information from before the window would leak in.
 
     Args:
-        count: images of the side.
+        count: number of images of the side.
         grouping: how they are grouped.
-        batch_size: images that attend to each other.
+        batch_size: number of images that attend to each other.
         seed: random seed of the order in `shuffled`.
     """
     order = np.arange(count)

@@ -45,7 +45,7 @@ class JaxDescriber:
         """A batch size, the devices that share such a batch, and the parameters on them."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let pickle send it to another process, whose CPU is split into as many devices as here.
+        """Pickle the model; the process that loads it splits its CPU into as many devices.
 
         The bits of a batch depend on the number of devices that share it.
         """

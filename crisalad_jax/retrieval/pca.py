@@ -55,11 +55,11 @@ class Pca(NamedTuple):
 
     mean: Float32[np.ndarray, " d"]
     components: Float32[np.ndarray, "dim d"]
-    """Orthonormal rows by descending variance; the largest entry of each in size is positive."""
+    """Orthonormal rows by descending variance; the entry of largest magnitude is positive."""
     variances: Float32[np.ndarray, " dim"]
     """Sample variances (divided by n - 1) of the fitted descriptors along the components."""
     total: Float32[np.ndarray, ""]
-    """Variance of the fitted descriptors in all directions."""
+    """Total variance of the fitted descriptors."""
     config: PcaConfig
     model: str = ""
     """The `model_hash` of the model whose descriptors were fitted; "" if it is not known."""
@@ -118,7 +118,7 @@ def shortened(
     Args:
         pca: the components; None leaves descriptors as they are.
         describer: the model.
-        name: name in messages of the model, or of what asks for the descriptors.
+        name: name for messages: of the model, or of what needs the descriptors.
         unit: whether the descriptors must be unit vectors.
 
     Returns:
@@ -144,8 +144,8 @@ def shortened(
         length, is_unit = len(pca.components), pca.config.renormalise
     require(
         is_unit or not unit,
-        f"{name}: found descriptors whose lengths are left as they are, expected unit vectors, "
-        "which are compared by cosine",
+        f"{name}: found descriptors that are not normalised, expected unit vectors, which are "
+        "compared by cosine",
     )
     return length, is_unit
 

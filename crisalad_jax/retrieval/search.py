@@ -62,7 +62,7 @@ def search(
             float32; or bits from `pack_bits`.
         queries: unit descriptors of the q queries, or their bits.
         k: number of neighbours per query, at most n.
-        chunk: database rows compared at a time, rounded up to a multiple of the devices.
+        chunk: database rows compared at a time, rounded up to a multiple of the device count.
         quiet: whether to hide the progress bar.
 
     Returns:
@@ -188,7 +188,7 @@ def _largest(
     mesh: Mesh,
     width: int,
 ) -> tuple[Float32[Array, "m q"], Int32[Array, "m q"]]:
-    """Find the largest products on each device, and their places; rows from `valid` are padding."""
+    """Find the largest products on each device, and their places; padding starts at `valid`."""
 
     def on_a_device(rows: Array, valid: Array, queries: Array) -> tuple[Array, Array]:
         wide = rows.astype(jnp.float32)

@@ -4,8 +4,8 @@ The rows of a segment go to a store. Then its record, JSON with a checksum, is r
 name: that single rename commits the segment. A process killed at any moment leaves the rows as they
 were before the segment or after it.
 
-A change commits any number of segments with one record of its own. The names of their records say
-which change they wait for.
+A change commits any number of segments with a single record. The names of the segments' records
+say which change they wait for.
 """
 
 import collections
@@ -65,7 +65,7 @@ class Segments:
             dtype: type of the rows.
             take: called with each record and its file in order, now and when one is appended.
                 Records of segments have the `names` of their rows, those of changes the number of
-                `rows` after them. By default, records are appended to `records`.
+                `rows` after the change. By default, records are appended to `records`.
 
         Raises:
             InputError: a record or its rows are damaged or missing.

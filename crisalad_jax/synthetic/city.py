@@ -1,4 +1,4 @@
-"""The city: two cities for training and one for testing, in the layouts of real data sets."""
+"""Synthetic cities: two for training and one for testing, in the layouts of real data sets."""
 
 import dataclasses
 import math
@@ -93,7 +93,7 @@ def _files(config: SyntheticCityConfig) -> Files:
 
 
 def _shots(config: SyntheticCityConfig, split: int, indices: range) -> Iterator[Shot]:
-    """Take the pictures of some places, which stand on a square grid with small offsets."""
+    """Take the pictures of some places, which lie on a square grid with small offsets."""
     columns = math.isqrt((config.train_places, config.test_places)[split] - 1) + 1
     for number, index in enumerate(indices, start=1):
         seed = derive_seed(config.seed, split, index)
@@ -106,7 +106,7 @@ def _shots(config: SyntheticCityConfig, split: int, indices: range) -> Iterator[
 
 
 def _train_views(rng: Rng) -> list[View]:
-    """Go through the seasons and hours in an order drawn for the place."""
+    """Draw a view for each season, with seasons and hours in random order."""
     order = zip(rng.permutation(4), rng.permutation(4), strict=True)
     return [_draw_view(rng, SEASONS[season], _HOURS[hour]) for season, hour in order]
 

@@ -59,7 +59,7 @@ def corridor(rng: Rng) -> Place:
 
 
 def room(rng: Rng) -> Place:
-    """Build a room: a wide box, also with things along its end, and furniture on its floor."""
+    """Build a room: a wide box, with objects along its end wall too, and furniture."""
     width, length = rng.uniform(3.5, 10.0), rng.uniform(7.0, 13.0)
     left = -width * rng.uniform(0.3, 0.7)
     box = _Box(left, left + width, rng.uniform(2.3, 4.2), length)
@@ -83,7 +83,7 @@ def _place(mesh: Mesh, rng: Rng, box: _Box, step: float) -> Place:
 def _shell(rng: Rng, box: _Box) -> Mesh:
     """Build floor, ceiling, end and side walls, with what is on them."""
     mesh, height, length = Mesh(_EYE), box.height, box.length
-    mesh.layer = GROUND_LAYER + 1  # walls and ceiling, before all that stands in the corridor
+    mesh.layer = GROUND_LAYER + 1  # walls and ceiling, painted before all objects
     walls = [pick(rng, WALLS), pick(rng, WALLS)]
     if rng.random() < 0.7:
         walls[1] = walls[0]
@@ -141,7 +141,7 @@ def _floor(mesh: Mesh, rng: Rng, box: _Box) -> None:
 
 
 def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
-    """Add the ceiling: plain, of panels, with beams, pipes or a skylight; and its lamps."""
+    """Add the ceiling with its lamps, at times also panels, beams and pipes."""
     left, right, height, length = box
     colour = pick(rng, _CEILINGS)
     ceiling = flat(left, _START, right, length, height)
@@ -230,7 +230,7 @@ def _stains(front: Mesh, rng: Rng, wall: Colour, box: _Box) -> None:
 def _along_wall(front: Mesh, rng: Rng, start: float, stop: float, height: float) -> None:
     """Add doors, windows, boards and furniture along one wall, one after another."""
     doors, trim = pick(rng, _WOOD), 0.9 * pick(rng, _WOOD)
-    # What recurs in this corridor; the spacing, and what comes between, identifies the place.
+    # What recurs along this wall; the order and the spacing identify the place.
     kinds = ("door", "recess", "window", "board", "pillar", "cupboard", "bench", "box")
     kinds += ("opening", "pipe")
     weights = rng.dirichlet(np.full(len(kinds), 0.7))

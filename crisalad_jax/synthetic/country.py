@@ -247,7 +247,7 @@ def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
 
 
 def _roadside(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
-    """Add a sign or a rock."""
+    """Add up to two signs or rocks."""
     for z in rng.uniform(5, 40, int(rng.integers(0, 3))):
         x = way.at(z) + float(rng.choice((-1, 1))) * (half + rng.uniform(0.5, 1.5))
         foot = mesh.at(x, z)

@@ -86,10 +86,10 @@ class Shot(NamedTuple):
     """Metres from the set's south-west corner, like `north`."""
     north: float = 0.0
     northdeg: int = 0
-    """Degrees of the camera from north."""
+    """Heading of the camera in degrees from north."""
 
     def draw_date(self) -> tuple[int, int]:
-        """Draw the year; the month is that of the season."""
+        """Draw a year, and return it with the month of the season."""
         return int(self.rng.integers(2012, 2022)), _MONTHS[self.view.season]
 
     def draw_panoid(self) -> str:
@@ -133,11 +133,11 @@ def utm_images(shots: Iterable[Shot], scenery: str = "", *, camera: bool = False
 
 
 def derive_seed(*numbers: int) -> int:
-    """Derive a place's own seed, for instance from a set's seed, a split and a number."""
+    """Derive the seed of a place, for instance from a set's seed, a split and an index."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
 
 
 def jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Compress a picture with quality 92."""
+    """Compress a picture as a JPEG of quality 92."""
     _, data = cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 92))
     return data.tobytes()

@@ -54,7 +54,7 @@ _LEAVES: dict[Season, tuple[Colour, ...]] = {
     "autumn": palette("70 46 12, 60 23 10"),
     "winter": palette("40 34 29, 40 34 29"),
 }
-"""Two hues per season between which leaves lie; in winter trees have none, and bushes twigs."""
+"""Two hues per season, between which leaves vary; in winter trees have none, and bushes twigs."""
 _SNOW: dict[int, float] = {
     Kind.ROOF: 0.92,
     Kind.LEDGE: 0.75,
@@ -79,7 +79,7 @@ GLOW: dict[int, tuple[float, Vector]] = {
 
 
 def light_of(view: View, place: Place, rng: Rng) -> Light:
-    """Combine the light of the hour with the weather and the season's sun, or use lamplight.
+    """Combine the light of the hour with the weather and the season's sun; indoors, use lamplight.
 
     The sun's direction is drawn at random: about south at noon, west at dusk.
     """

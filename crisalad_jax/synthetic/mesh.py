@@ -41,7 +41,7 @@ SLANTED: Vector = (0.0, 0.5, -0.85)
 class Kind(enum.IntEnum):
     """Material of a part, which decides how season and light change it.
 
-    SOIL is a field or ballast: it has its own colour, and snow on it in winter. BUSH is leaves that
+    SOIL is a field or ballast, in the part's colour, with snow in winter. BUSH is leaves that
     become bare twigs in winter. WINDOW is an opening to the sky, seen from inside.
     """
 
@@ -226,7 +226,7 @@ class Mesh:
 
 
 class Reach(NamedTuple):
-    """Where cameras stand in a place."""
+    """Range of camera positions in a place."""
 
     height: tuple[float, float]
     """Minimum and maximum metres above the ground."""
@@ -258,6 +258,6 @@ class Place(NamedTuple):
 
 
 def draw_hills(rng: np.random.Generator, most: float) -> Float[np.ndarray, " bearing"]:
-    """Draw the hills of a place, no steeper than the tangent `most`."""
+    """Draw the hills of a place, at most `most` high, as a tangent."""
     ridge = rng.uniform(0.0, 1.0, 24) ** 2 * rng.uniform(0.02, most)
     return np.interp(np.arange(96), np.arange(24) * 4.0, ridge, period=96)

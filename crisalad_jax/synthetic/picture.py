@@ -68,7 +68,7 @@ def render(
     if view.occluders is not None:
         passers = build_passers(view.occluders, place.lanes, place.traffic, view.crowd)
         scene = Scene(*map(np.concatenate, zip(scene, passers, strict=True)))
-        # A draw of 0 switches the lights of every vehicle on.
+        # A draw of 0 switches on the lights of every vehicle.
         draw = np.concatenate((draw, np.zeros(len(passers.polygon_sizes))))
     if not place.indoors:
         picture.draw_sky()

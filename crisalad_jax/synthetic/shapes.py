@@ -1,7 +1,7 @@
 """One place made of meaningless boxes, poles and sheets, with patterns on them.
 
 A model may learn to recognise streets and rooms by their windows and doors. Here all shapes, sizes
-and colours are drawn freely (after "dead leaves", Baradad et al. 2021, but in 3D).
+and colours are random (after "dead leaves", Baradad et al. 2021, but in 3D).
 """
 
 import numpy as np
@@ -47,7 +47,7 @@ def shapes(rng: Rng) -> Place:
 
 
 def _colour(rng: Rng) -> Colour:
-    """Draw a colour, as often grey as bright."""
+    """Draw a colour, more often greyish than saturated."""
     grey, saturation = rng.uniform(0.08, 0.9), rng.random() ** 2
     return np.clip(grey * (1 + saturation * rng.uniform(-1, 1, 3)), 0.03, 0.95)
 

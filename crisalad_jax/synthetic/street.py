@@ -68,7 +68,7 @@ def street(rng: Rng) -> Place:
 
 
 def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> None:
-    """Add pavements, the street, the crossing at its far end, and their lines."""
+    """Add pavements, the street, the crossing at its far end, and their markings."""
     paving, asphalt = pick(rng, _PAVING), pick(rng, _ASPHALT)
     left, right = kerbs
     mesh.ground(flat(-900, -20, 900, 2500), (0.44, 0.46, 0.40), Kind.GRASS)
@@ -119,7 +119,7 @@ def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
 
 
 def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> None:
-    """Add the row that closes the street, at varying distances and at times with a gap."""
+    """Add the buildings that close the street, at varying distances and at times with a gap."""
     reach = 14 + length * 0.7
     stands: list[tuple[float, float, float]] = []
     x = -reach

@@ -102,7 +102,7 @@ class Camera:
         return self.centre + self.focal * seen[:, :2] * (1, -1) / seen[:, 2:]
 
     def outlines(self, seen: np.ndarray, sizes: np.ndarray) -> list[np.ndarray | None]:
-        """Project polygons, which are runs of points, to quarters of a pixel; None out of sight."""
+        """Project polygons (runs of points) to quarters of a pixel, or to None if out of sight."""
         ends = np.cumsum(sizes)
         starts = ends - sizes
         x, y, depth = seen.T

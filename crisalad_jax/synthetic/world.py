@@ -33,7 +33,7 @@ from crisalad_jax.synthetic.view import (
 Variation = Literal["stand", "season", "time", "weather", "traffic", "exposure"]
 """What varies between the images of a place, in addition to paint; exposure includes the noise.
 
-The sun's position, the clouds and the white balance follow a picture's seed, which always varies.
+The sun's position, clouds and white balance depend on a picture's seed, which always varies.
 """
 VARIATIONS: tuple[Variation, ...] = get_args(Variation)
 _FIELDS: dict[Variation, tuple[str, ...]] = {
@@ -41,7 +41,7 @@ _FIELDS: dict[Variation, tuple[str, ...]] = {
     "traffic": ("occluders", "crowd"),
     "exposure": ("exposure", "noise"),
 }
-"""Fields of `View` that belong to a variation, where it is not the field of the same name."""
+"""Fields of `View` that a variation changes, if not just the field of the same name."""
 _SCENES_PER_CITY = 12
 _SPACING = 100.0
 """Metres between places in the files; stations of a scene are closer."""
@@ -64,8 +64,8 @@ class WorldConfig:
     repaint: Repaint = 0.3
     """Largest `View.repaint`."""
     varied: tuple[Variation, ...] = VARIATIONS
-    """What varies between the training images of a place. The rest is as in a plain `View`; without
-    "stand", the camera is the scene's. Test images vary in all of these."""
+    """What varies between the training images of a place. Other fields are as in a plain `View`;
+    without "stand", all images share the scene's camera. Test images vary in all of these."""
     hard: Annotated[float, limited(0, 1)] = 0.3
     """Share of the images taken from far to the side, turned, or through a crowd."""
     seed: Seed = 0
@@ -150,7 +150,7 @@ def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: R
 
 
 def _harden(view: View, reach: Reach, rng: Rng) -> View:
-    """Move the camera far to the side and turn it, and add a crowd in one of three views."""
+    """Move the camera far to the side and turn it, and add a crowd in a third of the views."""
     return dataclasses.replace(
         view,
         lateral=rng.uniform(-2.2, 2.2) * reach.lateral,

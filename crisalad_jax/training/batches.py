@@ -34,7 +34,7 @@ def prepared_as(config: TrainConfig) -> dict[str, Any]:
 
 
 class Drawn(NamedTuple):
-    """The batches of an epoch that were drawn by descriptors, which a run saves with its state."""
+    """Batches of an epoch from a descriptor-based sampler; a run saves them with its state."""
 
     step: Int32[np.ndarray, ""]
     """First step of the epoch; -1 before the first."""
@@ -42,10 +42,10 @@ class Drawn(NamedTuple):
 
 
 class PlaceBatches:
-    """The batches of places of one set or a mixture, or of groups of classes in turn.
+    """Batches of places from one set or a mixture, or from groups of classes in turn.
 
-    The images of a mixture are numbered consecutively over its sets, and the sub-batches of a batch
-    follow each other.
+    The images of a mixture are numbered consecutively over its sets, and a batch concatenates its
+    sub-batches.
     """
 
     def __init__(
@@ -80,8 +80,8 @@ class PlaceBatches:
             self._turns = tuple(JoinedPlaces((group,)) for group in groups)
             self.classes = tuple(len(group.names) for group in groups)
         self.mined: Drawn | None = None
-        """The current epoch, if it was drawn by descriptors; a run saves it."""
-        # Every set draws once, to find out before the run whether it can. The first sets the epoch.
+        """Batches of the current epoch, if a sampler reads descriptors; a run saves them."""
+        # Each set draws once, to fail before the run if it cannot. The first defines the epoch.
         each_set = zip(self._runs, *(turn.sets for turn in self._turns), strict=True)
         steps, *_ = [_steps(run, *groups) for run, *groups in each_set]
         if grouping is not None and grouping.steps is not None:
@@ -92,7 +92,7 @@ class PlaceBatches:
             self.mined = Drawn(np.array(-1, np.int32), np.zeros(shape, np.int32))
 
     def is_due(self, step: int) -> bool:
-        """Return whether this step begins an epoch whose batches are to be drawn by descriptors."""
+        """Return whether this step begins an epoch that `mine` has yet to draw."""
         begins = step % self.steps_per_epoch == 0
         return self.mined is not None and begins and int(self.mined.step) != step
 
@@ -159,7 +159,7 @@ def _draw(run: TrainConfig, places: Places, **how: Any) -> Int[np.ndarray, "step
 
 
 def _steps(run: TrainConfig, *groups: Places) -> int:
-    """Count the steps that take each place of a set about once; of groups, those of the longest."""
+    """Count the steps that visit each place of a set about once; for groups, the maximum."""
     if run.sampler.describes:
         (places,) = groups
         run.sampler.check(places)

@@ -23,7 +23,7 @@ Numbers = Mapping[str, int | float]
 
 
 class StopTraining(Exception):
-    """Raised by a callback to end a run: it is saved, and the same call resumes it.
+    """Raised by a callback to end a run, which is saved; the same call resumes it.
 
     Example:
         >>> class FirstStep(Callback):
@@ -88,7 +88,7 @@ def register_callback(name: str) -> Callable[[_C], _C]:
         The decorator, for a class that inherits from `Callback` and is made without arguments.
 
     Raises:
-        InputError: on decoration, if the name is taken, or it is not such a class.
+        InputError: on decoration, if the name is taken or the object is not such a class.
 
     Example:
         >>> @register_callback("print-recall")
@@ -132,10 +132,10 @@ class Callbacks:
         made = [make_callback(each) for each in callbacks]
         self._each = made if is_primary() else []
         self.stopped = False
-        """Whether one has asked to stop."""
+        """Whether a callback has asked to stop."""
 
     def call(self, method: str, *arguments: Any) -> None:
-        """Call a method of each, in order."""
+        """Call a method of each callback, in order."""
         for each in self._each:
             try:
                 getattr(each, method)(*arguments)
@@ -183,9 +183,9 @@ def _write_rows(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 @register_callback("wandb")
 class WandbCallback(Callback):
-    """A run of Weights & Biases, named like the folder; configured by the variables WANDB_....
+    """A Weights & Biases run named after the folder, configured by WANDB_* environment variables.
 
-    A run that resumes continues the same one.
+    Resuming a run continues the same W&B run.
     """
 
     def __init__(self) -> None:
@@ -193,7 +193,7 @@ class WandbCallback(Callback):
         self._wandb = _imported("wandb")
 
     def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
-        """Start the run, or resume that of this folder."""
+        """Start the run, or resume the one recorded in the folder."""
         identity = out / "wandb-run"
         if not identity.exists():
             identity.write_text(secrets.token_hex(4), encoding="utf-8")
@@ -213,14 +213,14 @@ class WandbCallback(Callback):
 
 @register_callback("mlflow")
 class MlflowCallback(Callback):
-    """A run of MLflow, named like the folder; configured by the variables MLFLOW_...."""
+    """An MLflow run named after the folder, configured by MLFLOW_* environment variables."""
 
     def __init__(self) -> None:
         """Import the package."""
         self._mlflow = _imported("mlflow")
 
     def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
-        """Start the run, or resume that of this folder, and log the configuration."""
+        """Start the run and log the configuration, or resume the one recorded in the folder."""
         identity = out / "mlflow-run"
         if identity.exists():
             self._mlflow.start_run(run_id=identity.read_text(encoding="utf-8"))
@@ -230,7 +230,7 @@ class MlflowCallback(Callback):
         self._mlflow.log_dict(to_plain(config), "config.json")
 
     def on_step(self, numbers: Numbers) -> None:
-        """Log the metrics, under the same tags as for TensorBoard."""
+        """Log the metrics; R@1 becomes R1, because MLflow names cannot contain @."""
         metrics = {name.replace("@", ""): value for name, value in numbers.items()}
         self._mlflow.log_metrics(metrics, step=int(numbers["step"]))
 
@@ -242,7 +242,7 @@ class MlflowCallback(Callback):
 
 
 def _imported(package: str) -> Any:
-    """Import a package that no extra installs.
+    """Import a package that none of our extras installs.
 
     Raises:
         InputError: it is not installed.

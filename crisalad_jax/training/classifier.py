@@ -24,7 +24,7 @@ class Classifiers(NamedTuple):
     weights: PyTree
     """Leaves have a leading axis of groups. Padding beyond a group's classes never changes."""
     optimiser: PyTree
-    """Adam's state for each group: a group keeps its moments while others train."""
+    """Adam's state for each group; a group's moments do not change while others train."""
 
 
 def init_classifiers(
@@ -76,7 +76,7 @@ def _filled(leaf: Array, count: int, largest: int) -> Array:
 def update_classifiers(
     classifiers: Classifiers, group: Int[Array, ""], gradient: PyTree, learning_rate: float
 ) -> Classifiers:
-    """Take a step of one group's Adam (Kingma and Ba 2015); the others stay as they are."""
+    """Take an Adam step (Kingma and Ba 2015) for one group; the others do not change."""
     mine = jax.tree.map(lambda leaf: leaf[group], classifiers)
     updates, optimiser = optax.adam(learning_rate).update(gradient, mine.optimiser)
     stepped = Classifiers(optax.apply_updates(mine.weights, updates), optimiser)
@@ -87,9 +87,9 @@ def update_classifiers(
 def load_loss(path: str | os.PathLike[str]) -> tuple[LossConfig, PyTree]:
     """Read the loss of a run and its learnt parameters.
 
-    `load` reads the model of the same file. A run that starts from the file initialises the
-    parameters of its loss again. Those of a loss that classifies, a vector for each class of the
-    training set, are only in the run's `state/`.
+    `load` reads the model from the same file. A run that starts from the file reinitialises its
+    loss. Class vectors, and a projection to a teacher's descriptor length, are stored only in a
+    run's `state/`.
 
     Args:
         path: the `last.safetensors` or `best.safetensors` of a run.
@@ -98,8 +98,8 @@ def load_loss(path: str | os.PathLike[str]) -> tuple[LossConfig, PyTree]:
         (configuration, parameters), as `metric_loss` takes them.
 
     Raises:
-        InputError: what `load` raises; the loss has learnt nothing, or classifies; or it is a
-            part that is not registered.
+        InputError: what `load` raises; the file has no parameters of a loss; or the loss is not
+            registered.
 
     Example:
         >>> import crisalad_jax as cj

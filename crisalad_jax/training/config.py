@@ -54,15 +54,15 @@ class OptimiserConfig:
     warmup_epochs: NonNegativeInt = 0
     """Epochs of warm-up, instead of `warmup_steps`."""
     weight_decay: NonNegativeFloat = 0.01
-    """Weight decay, by default torch's for AdamW; the paper gives none. Optimisers without a weight
-    decay add it to the gradient, as torch's Adam and SGD do."""
+    """Weight decay; the default is torch's for AdamW, as the paper states no value. Optimisers
+    without weight decay add it to the gradient, as torch's Adam and SGD do."""
     clip_norm: PositiveFloat | None = None
     """Maximum norm of the whole gradient."""
     clip_value: PositiveFloat | None = None
     """Maximum absolute value of a gradient element, after `clip_norm`."""
     accumulate: PositiveInt = 1
     """Number of batches whose gradients are averaged for one optimiser step. `warmup_steps` counts
-    these steps. As in Lightning, the last batch of an epoch also steps; the sum of the remaining
+    these steps. As in Lightning, the last batch of an epoch always steps; the sum of the remaining
     gradients is divided by the same number."""
     ema: Fraction | None = None
     """Decay of an exponential moving average of the weights per optimiser step, such as 0.999;
@@ -91,7 +91,7 @@ class MiningConfig:
 
     kind: Literal["none", "whole", "sample"] = "none"
     """Database images that a round describes: "none", for training sets of places; the "whole"
-    database, of which each query draws its own candidates, plus its previous negatives (NetVLAD);
+    database, from which each query draws candidates, in addition to its last negatives (NetVLAD);
     or a "sample" of candidates for all queries of the round, and their positives (MSLS)."""
     negatives: PositiveInt = 10
     """Negatives per tuple: the nearest candidates."""
@@ -193,7 +193,7 @@ class TrainConfig:
     mixture: tuple[MixtureSet, ...] = ()
     """Several training sets, instead of one with `sampler` and `loss`. Each step takes a sub-batch
     of each, computes its loss separately, and adds the losses. Images attend only within their
-    sub-batch. The first set determines the epoch."""
+    sub-batch. The first set determines the length of an epoch."""
     cities: tuple[str, ...] | None = None
     """Cities to use; None is all."""
     epochs: PositiveInt = 8
@@ -240,7 +240,7 @@ class TrainConfig:
             (self, "images_per_place", is_tuple, f"{size} with mined tuples"),
             (self, "min_images", self.min_images >= images or self.mines, f"at least {images}"),
             (self, "trainable", all(terms), "words and patterns with commas between them"),
-            (self, "trainable", adapts, "head, last-N-blocks,norm,head or all without adapters"),
+            (self, "trainable", adapts, "head, all or last-N-blocks,norm,head without adapters"),
         ):
             require_field(config, name, fits, expected)
         if self.validation_size is not None:
@@ -256,7 +256,7 @@ class TrainConfig:
         if not names:
             return
         shares = sum(each.share for each in self.mixture)
-        of_set = f"as by default with a mixture, whose sets have their own (mixture.{names[0]}"
+        of_set = f"the default: each set of a mixture has its own (mixture.{names[0]}"
         default = self.sampler == DEFAULT_SAMPLER
         divides = self.places_per_batch % shares == 0
         for config, name, fits, expected in (
@@ -295,7 +295,7 @@ class TrainConfig:
         return tuple(found) or (self,)
 
     def with_each(self, **changes: Callable[[Any], Any]) -> "TrainConfig":
-        """Apply functions to the sampler or the loss: the run's, or those of every set."""
+        """Apply functions to the sampler or loss of the run, or of each set of its mixture."""
 
         def changed(each: Any) -> Any:
             values = {name: change(getattr(each, name)) for name, change in changes.items()}

@@ -32,8 +32,8 @@ def join_processes(
 ) -> None:
     """Join a group of processes, before JAX is used for anything else.
 
-    On CPUs each process has one device: with several, whose threads wait for other processes, the
-    group could deadlock. On GPUs each process of a host also has one; see `local_device_ids`.
+    On CPUs each process has one device: with several, threads that wait for other processes could
+    deadlock the group. On GPUs each process of a host also has one; see `local_device_ids`.
 
     Args:
         coordinator: HOST:PORT of process 0, reachable from all; or "auto" if JAX can query the
@@ -46,7 +46,7 @@ def join_processes(
             only one GPU, all that it sees.
 
     Raises:
-        InputError: the arguments do not fit each other, or the others cannot be reached.
+        InputError: the arguments do not fit together, or other processes cannot be reached.
     """
     is_valid = count is None and index is None
     if coordinator != "auto":
@@ -82,7 +82,7 @@ def join_processes(
         jax.distributed.initialize(**given, heartbeat_timeout_seconds=HEARTBEAT)
     except (ValueError, RuntimeError) as error:
         raise InputError(
-            f"processes: cannot meet the others by --coordinator-address {coordinator}: {error} "
+            f"processes: cannot join the others at --coordinator-address {coordinator}: {error} "
             "(auto needs Slurm, Open MPI, Kubernetes or a Cloud TPU)"
         ) from error
 
@@ -119,7 +119,7 @@ def _check_port(address: str) -> None:
     """Check that process 0 can listen at this address; otherwise JAX would exit without a message.
 
     Raises:
-        InputError: it cannot.
+        InputError: it cannot listen there.
     """
     host, _, port = address.rpartition(":")
     try:
@@ -130,7 +130,7 @@ def _check_port(address: str) -> None:
             listener.bind(("", int(port)))
     except (OSError, OverflowError, UnicodeError) as error:
         raise InputError(
-            f"--coordinator-address: found {address}, which cannot be listened at "
+            f"--coordinator-address: found {address}, where this process cannot listen "
             f"({getattr(error, 'strerror', None) or error}), expected this host and a free port"
         ) from error
 
@@ -162,7 +162,7 @@ def broadcast(tree: _T) -> _T:
 
 
 def all_max(*numbers: int) -> tuple[int, ...]:
-    """Return the maximum over all processes of each number, from 0 and below 2**32."""
+    """Return the maximum of each number over all processes; numbers are 0 to 2**32 - 1."""
     return tuple(_gather(*numbers).max(axis=0).tolist())
 
 

@@ -63,7 +63,7 @@ class FitResult(NamedTuple):
     """Parameters after the last step."""
     steps: int
     best_recall: float | None
-    """Best validation recall, a fraction, by `TrainConfig.monitor`; None without one."""
+    """Best validation recall, a fraction, by `TrainConfig.monitor`; None without validation."""
     stopped_early: bool
     """Whether it ended before its last epoch, by `TrainConfig.patience` or by a callback."""
     skipped_images: int
@@ -268,7 +268,7 @@ class _Loop:
 
         A single process checks its status before each step. Several exchange theirs every few
         steps, and do not wait for each other in between: one that has failed continues with batches
-        of no images until all know.
+        without valid images until all know.
         """
         step, per_round = self.files.record.step, self.data.steps_per_round
         every = STATUS_STEPS if jax.process_count() > 1 else 1
@@ -358,7 +358,7 @@ class _Loop:
         return self.files.record
 
     def _mine(self) -> None:
-        """Draw the batches of the round that begins, with the current model."""
+        """Draw the batches of the next round with the current model."""
         trainable = self.trainer.gather(self.trainer.state.trainable)
 
         def mine() -> str:

@@ -1,4 +1,4 @@
-"""End a process with a one-line error if another one of its run is lost, alone or with its host.
+"""End a process with a one-line error if another process of its run, or its host, is lost.
 
 JAX ends the others in one of two ways. An exchange raises an error, if the kernel of the lost
 process's host closes its connections; or JAX's service misses its heartbeats, and aborts each
@@ -24,7 +24,7 @@ HEARTBEAT = 60
 """Seconds without a heartbeat after which a process counts as lost."""
 _OF_EXCHANGES = re.compile(r"gloo|nccl|coordination service|connection (reset|closed)", re.I)
 """What JAX's error says when another process has left an exchange."""
-_NEXT = "the same command resumes from the last saved state, with as many processes or others"
+_NEXT = "the same command resumes from the last saved state, with any number of processes"
 _FILTER = """
 import re, sys
 of_jax, page = False, b""
@@ -47,7 +47,7 @@ _filters: list[subprocess.Popen[bytes]] = []
 def filter_aborts() -> None:
     """Filter C++ output through a small program, which replaces JAX's page with one line.
 
-    All of it goes to standard error; Python's own output goes where it went before.
+    All C++ output goes to standard error; Python's output goes where it went before.
     """
     program = subprocess.Popen(
         [sys.executable, "-ISc", _FILTER, _NEXT], stdin=subprocess.PIPE, start_new_session=True
@@ -66,11 +66,11 @@ def filter_aborts() -> None:
 def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
     """Wrap a function that processes call together: if one is lost, the others raise.
 
-    What the function holds is closed first, so that a state being written is complete. This process
-    then exits without JAX's shutdown, which would wait for the lost one.
+    The function's context managers exit first, so that a state being written is complete. This
+    process then exits without JAX's shutdown, which would wait for the lost one.
 
     Raises:
-        InputError: in place of JAX's error of an exchange with another process.
+        InputError: in place of JAX's error when an exchange with another process fails.
     """
 
     @functools.wraps(function)
@@ -85,7 +85,7 @@ def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
             for program in _filters:  # this process prints the line itself
                 program.kill()
             atexit.register(_leave)
-            raise InputError(f"processes: lost another one ({text[:120]}); {_NEXT}") from error
+            raise InputError(f"processes: lost another process ({text[:120]}); {_NEXT}") from error
 
     return call
 

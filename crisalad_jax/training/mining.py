@@ -77,7 +77,7 @@ class Miner:
         """Mine a tuple for each query of the round that begins with a step.
 
         Args:
-            step: the first step of the round; with the seed it draws candidates.
+            step: the first step of the round; with the seed, it determines the candidates drawn.
             describe: describes images with the current model.
 
         Returns:
@@ -122,7 +122,7 @@ class Miner:
         left_out = f"; {unreadable} unreadable images left out" if unreadable else ""
         return (
             f"mined {len(hard)} tuples: {100 * (hard > 0).mean():.0f} % have hard negatives, "
-            f"{hard.mean():.1f} in the mean{left_out}"
+            f"{hard.mean():.1f} on average{left_out}"
         )
 
     def _tuple(
@@ -138,7 +138,7 @@ class Miner:
         positive = queries.positives[query][nearest]
         farthest = np.inf if mining.margin is None else to_positives[nearest] + mining.margin
         order = np.argsort(to_candidates, kind="stable")[: mining.negatives]
-        images = np.full(2 + mining.negatives, positive)  # fills the places that candidates do not
+        images = np.full(2 + mining.negatives, positive)  # where candidates are too few
         roles = np.full(len(images), Role.SPARE)
         images[0], roles[:2] = queries.queries[query], (Role.QUERY, Role.POSITIVE)
         images[2:][: len(order)] = candidates[order]

@@ -11,8 +11,8 @@ from crisalad_jax.training.losses import LossConfig
 def with_sets(config: TrainConfig, names: Sequence[str]) -> TrainConfig:
     """Adapt a configuration to the given training sets.
 
-    A mixture is reduced to these sets, each with as many places as before. Without one, the sets
-    form a mixture, with the configuration's sampler and loss and equally many places for each.
+    A mixture is reduced to these sets, each with as many places as before. Without a mixture, they
+    form one, each with the configuration's sampler and loss and the same number of places.
 
     Args:
         config: the configuration of a recipe or an earlier run.

@@ -15,7 +15,7 @@ from crisalad_jax.training.schedules import RunSteps
 from crisalad_jax.utils.output import warn
 
 WARMUP_SHARE = 4
-"""Divisor of a run's steps: a warm-up takes at most a quarter of them, as BoQ's 10 of 40 epochs."""
+"""Divisor of a run's steps: a warm-up takes at most a quarter, as in BoQ (10 of 40 epochs)."""
 
 
 _Count = TypeVar("_Count", int, Array)
@@ -104,7 +104,7 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
         steps_per_epoch: number of batches of an epoch.
 
     Returns:
-        The optimiser, unchanged if its warm-up is short enough. A shortened warm-up is in steps.
+        The configuration, unchanged if the warm-up is short enough. A shortened one is in steps.
 
     Example:
         >>> with_short_warmup(OptimiserConfig(warmup_epochs=5), 32, 4).warmup_steps
@@ -126,8 +126,8 @@ def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: in
     flag = "epochs" if config.warmup_epochs else "steps"
     warn(
         f"--optimiser.warmup-{flag}: found {warmup} steps for a run of {steps}, which leaves "
-        f"{max(steps - warmup, 0)} at the learning rate and its decay; at most "
-        f"{short.warmup_steps} would be a quarter"
+        f"{max(steps - warmup, 0)} after the warm-up; expected at most {short.warmup_steps}, "
+        "a quarter"
     )
 
 
@@ -210,7 +210,7 @@ def _with_plain_keys(optimiser: optax.GradientTransformation) -> optax.GradientT
 
 
 class WeightAverage(NamedTuple):
-    """The part of an optimiser's state that averages the weights."""
+    """The part of an optimiser's state that holds the average of the weights."""
 
     weights: PyTree
 

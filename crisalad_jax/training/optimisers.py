@@ -167,8 +167,8 @@ class _OptaxOptimiser(Optimiser):
 def _matrices(weights: Any) -> Any:
     """Return the two axes of each matrix, and None for everything else; see `_MATRICES`.
 
-    The first axis of a stack numbers the blocks: stacked vectors are not matrices. Nor are tokens
-    and positions, because embeddings are not (Jordan et al. 2024).
+    The first axis of a stack numbers the blocks: stacked vectors are not matrices. Embeddings, such
+    as tokens and positions, are not treated as matrices either (Jordan et al. 2024).
     """
     from optax.contrib import MuonDimensionNumbers
 

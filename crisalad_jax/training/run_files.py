@@ -241,8 +241,8 @@ def extend_run(out: pathlib.Path, config: TrainConfig, record: RunRecord) -> Non
     write_json(path, to_plain(config))
     if config.optimiser.schedule.spans_run and record.step and not record.stopped_early:
         warn(
-            f"{out}: the learning rate falls over the whole run, so that it jumps at step "
-            f"{record.step}: this is not the run of {config.epochs} epochs at once; "
+            f"{out}: the learning rate falls over the whole run, so it jumps at step "
+            f"{record.step}, unlike in a run of {config.epochs} epochs from the start; "
             "--optimiser.schedule.decay-steps fixes the length of the decay"
         )
 

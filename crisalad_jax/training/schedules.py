@@ -133,7 +133,7 @@ class StepSchedule(Schedule):
     epochs: PositiveInt = 3
     """Epochs from one step down to the next."""
     gamma: PositiveFloat = 0.5
-    """What a step down multiplies the learning rate by."""
+    """Factor by which a step down multiplies the learning rate."""
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
         """Return the learning rate after the steps down so far."""
@@ -145,7 +145,7 @@ class StepSchedule(Schedule):
 
 @SCHEDULES.register("milestones")
 class MilestonesSchedule(Schedule):
-    """A step down after each of some epochs, counted from the start; the defaults are MixVPR's.
+    """A step down after each of the given epochs, from the start; the defaults are MixVPR's.
 
     A milestone before the end of the warm-up has no effect, as in GSV-Cities' code, where the
     warm-up overwrites the learning rate.
@@ -155,12 +155,12 @@ class MilestonesSchedule(Schedule):
     epochs: tuple[int, ...] = (5, 10, 15, 25, 45)
     """Epochs after which the learning rate steps down."""
     gamma: PositiveFloat = 0.3
-    """What a step down multiplies the learning rate by."""
+    """Factor by which a step down multiplies the learning rate."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
+        """Check that the epochs increase."""
         rises = bool(self.epochs) and all(a < b for a, b in pairwise((0, *self.epochs)))
-        require_field(self, "epochs", rises, "numbers of epochs that rise")
+        require_field(self, "epochs", rises, "increasing numbers of epochs")
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
         """Return the learning rate after the steps down so far."""

@@ -38,7 +38,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
 WHOLE_LOSS = 1024
-"""Maximum images for which every device computes the whole loss, at most a hundredth of a step's
+"""Maximum number of images for which every device computes the whole loss, at most 1 % of a step's
 work (docs/training.md). For more images, XLA splits the loss and exchanges its parts."""
 LossFunction = Callable[..., Float[Array, ""]]
 """Takes descriptors, labels and, if it has a third argument, which images are valid."""
@@ -58,8 +58,8 @@ class TrainState(NamedTuple):
     def saved_loss(self, config: LossConfig) -> PyTree:
         """Return the loss's parameters that weight files store, if any.
 
-        Class vectors and projections to a teacher's length are large and useless after the run:
-        only `state/` stores them.
+        Class vectors and projections to a teacher's descriptor length are large and useless after
+        the run: only `state/` stores them.
         """
         of_run = config.kind.grouping is not None or config.kind.reads_targets
         return None if of_run or self.classifiers is None else self.classifiers.weights
@@ -81,7 +81,7 @@ class Metrics(NamedTuple):
     accuracy: Float[Array, ""] | None
     """Share of the images that are nearest to their own class; None without classification."""
     loss_numbers: Mapping[str, Array] | None
-    """The loss's own numbers (`LossValue.numbers`)."""
+    """Other scalars of the loss (`LossValue.numbers`)."""
     gradient_norm: Float[Array, ""]
     """Norm of the whole gradient, including a classifier's."""
     learning_rate: Float[Array, ""] | None
@@ -344,15 +344,15 @@ def train_step(
 ) -> tuple[TrainState, Metrics]:
     """Take one optimiser step on the loss of a batch, or accumulate its gradient for one.
 
-    The gradient is that of the trainable parameters, and of the loss's own for the epoch's group.
-    If the loss classifies, labels are that group's classes. Dropout is drawn from `key` and the
-    step number, so that a resumed run repeats an uninterrupted one.
+    The gradient is that of the trainable parameters, and of the loss's parameters for the epoch's
+    group; labels are that group's classes if the loss classifies. Dropout is drawn from `key` and
+    the step number, so that a resumed run repeats an uninterrupted one.
 
     Running statistics in the state are updated as by torch's batch norms in training mode, and the
     batch is normalised by its own. If the state has none, the stored ones are used.
 
     If the loss or the gradient is not finite, or no image is valid, the state is returned unchanged
-    and `Metrics.updated` is False. Passed to the next step as `proceed`, it skips that step too. So
+    and `Metrics.updated` is False. Passed to the next step as `proceed`, False skips that step too:
     a loop can read metrics one step late and still have the state before the failed step.
 
     A loss that learns from a teacher takes the teacher's descriptors of the images as `targets`.

@@ -16,9 +16,9 @@ class AdapterSummary(NamedTuple):
 
     parameters: int
     macs: int
-    """Multiply-accumulates per image, with linears at all tokens."""
+    """Multiply-accumulates per image, with linear layers at all tokens."""
     paper_macs: int
-    """Multiply-accumulates as the paper counts: each linear once, convolutions at every patch."""
+    """Multiply-accumulates as in the paper: each linear layer once, convolutions at every patch."""
 
 
 @brief
@@ -106,9 +106,9 @@ def model_words(config: ModelConfig) -> str:
     backbone = config.backbone
     projection = "projected " if config.projection.dim else ""
     return (
-        f"backbone of width {backbone.dim}, {backbone.depth} blocks{backbone.extras}; "
-        f"aggregator {config.aggregator.part_name}; cross-image encoder "
-        f"{config.cross_image.part_name}; {projection}descriptor of {config.descriptor_dim} numbers"
+        f"backbone of width {backbone.dim}, {backbone.depth} blocks{backbone.extras}; aggregator "
+        f"{config.aggregator.part_name}; cross-image encoder {config.cross_image.part_name}; "
+        f"{projection}descriptor of {config.descriptor_dim} dimensions"
     )
 
 
@@ -122,10 +122,10 @@ def summary_json(summary: ModelSummary, name: str) -> dict[str, Any]:
 
 
 def summary_lines(summary: ModelSummary) -> list[str]:
-    """Format the rest of a summary as lines for the terminal."""
+    """Format a summary, without its table of parts, as lines for the terminal."""
     lines = [
         f"images                {summary.images}",
-        f"descriptor            {summary.descriptor:>13,} numbers",
+        f"descriptor            {summary.descriptor:>13,} dimensions",
         f"trainable             {summary.trainable_parameters:>13,} parameters "
         f"({summary.trainable})",
         f"frozen                {summary.frozen_parameters:>13,} parameters",

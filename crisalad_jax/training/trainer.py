@@ -59,8 +59,8 @@ class Trainer:
         mesh = self._devices.mesh
         if shard_state and mesh.size == 1:
             raise InputError(
-                "shard_state: found one device for the state, expected several; a CPU's do "
-                "not share a step where all trains"
+                "shard_state: found one device for the state, expected several; CPU devices do "
+                "not share a step if all parameters train"
             )
         self._step_config = step_config(
             config,
@@ -191,7 +191,7 @@ class Trainer:
         if needed > limit:
             raise InputError(
                 f"training: found a step that takes {needed / 1e9:.1f} GB of each device, expected "
-                f"at most {limit / 1e9:.1f} GB; less take a smaller --micro-batch (now "
+                f"at most {limit / 1e9:.1f} GB; reduce it with a smaller --micro-batch (now "
                 f"{self._config.micro_batch}), --model.compute-dtype bfloat16, --model.remat full, "
                 "--shard-state, a smaller image or model, or more devices"
             )

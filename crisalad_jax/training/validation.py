@@ -33,7 +33,7 @@ class Validation(NamedTuple):
     monitored: float
     """The recall, or sum of recalls, that `TrainConfig.monitor` names."""
     metrics: dict[str, float]
-    """Recalls, and the means of the transport's statistics."""
+    """Recalls, mean transport statistics, and scalars of the aggregator and cross-image encoder."""
     words: str
     """The recalls as text."""
 

@@ -251,7 +251,7 @@ def _check_vocabulary(config: ModelConfig) -> None:
 def _read_features(
     model: Model, paths: Sequence[pathlib.Path], reading: Reading, seed: int, *, quiet: bool
 ) -> list[Float32[np.ndarray, "feature dim"]]:
-    """Read unit features of up to `PATCHES` patches of each image, without those of zeros."""
+    """Read unit features of up to `PATCHES` patches of each image, without all-zero ones."""
     config = model.config
     devices = devices_for(reading.batch_size)
     params = devices.replicate(cast_params(model.params, config))

@@ -51,7 +51,7 @@ class ChangedFileError(InputError):
     """A file whose bytes do not match their checksum."""
 
     def __init__(self, path: object) -> None:
-        """Take the file, for the message."""
+        """Name the file in the message."""
         super().__init__(
             f"{path}: found other bytes than were written, expected those of its checksum "
             "(SHA-256): the file is damaged or was changed"
@@ -60,4 +60,4 @@ class ChangedFileError(InputError):
 
 def tell_unchecked(path: object, missing: str = "no checksum") -> None:
     """Warn that a file, such as one of another program, has no checksum."""
-    warn(f"{path}: found {missing}, as of other programs; not checked")
+    warn(f"{path}: found {missing}, as in files of other programs; not checked")

@@ -34,15 +34,15 @@ _CLIENT_PORT = 10001
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # no telemetry
     "RAY_SCHEDULER_EVENTS": "0",  # nor the autoscaler's lines
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # nor a warning of it
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # nor a warning about this variable
 }
 CONNECT, ANSWER, START, RESULT = 60.0, 120.0, 300.0, 1800.0
-"""Seconds to wait at most: for a cluster, for its nodes' answers, for the first worker, and for any
+"""Maximum seconds to wait: for a cluster, for its nodes' answers, for the first worker, and for any
 worker's result."""
 _REASON = 300
 """Maximum characters to quote from Ray's message about the end of a worker."""
 _STARTS = -1
-"""In place of an item's number: its worker is starting."""
+"""Used in place of an item's number while a worker is starting."""
 _TRIES = 5
 """How many workers may end at the same item, or while they start, before this is an error."""
 
@@ -133,7 +133,7 @@ def _join(ray: Any, address: str, what: str) -> None:
         except Exception as error:  # Ray raises many types
             raise InputError(f"{what}: cannot be joined: {_reason(error)}") from error
     if not joined:
-        raise InputError(f"{what}: found no answer of a Ray cluster within {CONNECT:.0f} s")
+        raise InputError(f"{what}: found no answer from a Ray cluster within {CONNECT:.0f} s")
 
 
 def _reason(error: Exception) -> str:
@@ -260,7 +260,7 @@ class _Worker:
     """An actor that calls a function in a process of a node, where it stays in memory."""
 
     def __init__(self, folder: str, environment: Mapping[str, str]) -> None:
-        """Change to the folder of relative paths, if it exists here, and set variables."""
+        """Change to the folder that relative paths start from, if it exists, and set variables."""
         os.environ.update(environment)
         with contextlib.suppress(OSError):
             os.chdir(folder)
@@ -308,7 +308,7 @@ def map_in_order(
         environment: variables that are set in each process before that.
 
     Raises:
-        InputError: what `work` raises as one, with the node's name; workers end repeatedly; or none
+        InputError: an InputError of `work`, with the node's name; workers end repeatedly; or none
             has a result within `RESULT` seconds.
     """
     count, resources = _slots(ray)

@@ -37,7 +37,7 @@ _TESTED = ((0, 10), (0, 12))
 if jax.__version_info__[:2] not in _TESTED:  # before a crash, however the package is used
     tested = " and ".join(".".join(map(str, version)) for version in _TESTED)
     warn(
-        f"found jax {jax.__version__}, tested are {tested}: results are not checked, and 0.11 "
+        f"found jax {jax.__version__}, tested with {tested}: results are not checked, and 0.11 "
         "crashes on several devices; pip install --upgrade 'jax>=0.12,<0.13'"
     )
 
@@ -49,7 +49,7 @@ def compiler_options(
 
     Another version may lack an option, or crash with it; without any, a program is just as correct,
     at most slower. A program that `runs_long`, such as a training step, is not scheduled for the
-    least memory, which would take it 6 % longer. The options depend on the processor, and on the
+    least memory, which would make it 6 % slower. The options depend on the processor, and on the
     `compute_dtype` of the program's model, None without a model.
     """
     if target().platform != "cpu" or jax.__version_info__[:2] not in _TESTED:
@@ -120,7 +120,7 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
 def number_types(leaves: Sequence[Any] = ()) -> Iterator[None]:
     """Compute in JAX's 32-bit mode, unless a configuration among the `leaves` is of float64.
 
-    A program may be in the 64-bit mode for another package. Numbers without an explicit type, as in
+    A program may use the 64-bit mode for another package. Numbers without an explicit type, as in
     `jnp.zeros` or an optimiser's schedule, would then be float64, and results would differ. It may
     also forbid promotion or compilation, which the code here relies on.
     """
@@ -173,7 +173,7 @@ def set_up() -> Session:
     take precedence.
 
     Returns:
-        The devices and the cache; once JAX is used, devices stay as they are.
+        The devices and the cache; once JAX has been used, the devices no longer change.
 
     Example:
         >>> session = set_up()

@@ -30,7 +30,7 @@ class Devices(NamedTuple):
     mesh: Mesh
 
     def shard_batch(self, rows: np.ndarray) -> jax.Array:
-        """Shard a batch over the devices, with equally many rows on each.
+        """Shard a batch over the devices, with the same number of rows on each.
 
         Each process gives the rows of its own devices, in the order of the processes.
         """
@@ -96,10 +96,10 @@ def shard_spec(mesh: Mesh, shape: tuple[int, ...]) -> NamedSharding:
 
 
 def devices_for(count: int, *, processes: bool = False) -> Devices:
-    """Choose as many devices as divide `count` images, from this process or equally from all.
+    """Choose the most devices that divide `count` images, from this process or equally from all.
 
     Raises:
-        InputError: the processes cannot share them.
+        InputError: the processes cannot share the images equally.
     """
     groups = [jax.local_devices()]
     if processes:

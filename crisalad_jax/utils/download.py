@@ -16,7 +16,7 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.version import VERSION
 
 OFFLINE = "CRISALAD_OFFLINE"
-"""Environment variable: whether to use no network."""
+"""Environment variable: whether to forbid the network."""
 _CHUNK = 2**18
 _MEGABYTE = 1e6
 _PARTIAL, _NO_SUCH_RANGE = 206, 416
@@ -26,7 +26,7 @@ _GONE = (404, 410)
 _TIMEOUT = 30.0
 """Seconds without an answer before an attempt fails."""
 _ATTEMPTS = 5
-"""Consecutive attempts that bring less than a megabyte, before the download fails."""
+"""Consecutive attempts with less than a megabyte each before the download fails."""
 _PAUSE = 1.0
 """Seconds before the second attempt; the wait doubles for each further one."""
 
@@ -37,7 +37,7 @@ def is_offline() -> bool:
 
 
 class MissingFileError(InputError):
-    """No file exists at an address."""
+    """An address at which there is no file."""
 
 
 class _PassingFault(Exception):

@@ -42,7 +42,7 @@ def few(problems: Sequence[str]) -> str:
 
 
 class Interrupted(Exception):
-    """A signal asked the program to end, and its work is saved."""
+    """A signal to end the program, whose work is saved."""
 
     def __init__(self, number: int, where: str = "") -> None:
         """Take the signal's number; `where` says in a few words how far the work is."""

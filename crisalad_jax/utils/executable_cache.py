@@ -49,8 +49,8 @@ class _Folder:
 def cache_executables() -> None:
     """Cache compiled programs from now on, in a folder that only the user can write to.
 
-    A program that runs nothing but this package may call it: code that is changed at run time, as
-    in a notebook, is not part of the key. If there can be no such folder, nothing is cached.
+    Call it only in a program that runs nothing but this package: code that is changed at run time,
+    as in a notebook, is not part of the key. Without such a folder, nothing is cached.
     """
     with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
         folder = user_cache() / "programs"
@@ -77,7 +77,7 @@ def cached_executable(
         static_argnames: names of those that are part of the program.
 
     Returns:
-        The call of the program; None if programs are not cached: on accelerators, and for a lambda
+        A function that calls it; None if programs are not cached: on accelerators, and for a lambda
         or a function defined in another, since the key does not cover its closure.
     """
     if _Folder.path is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
@@ -164,7 +164,7 @@ def _is_ones_own(path: pathlib.Path) -> bool:
 
 
 def _read(path: pathlib.Path, tree: Any, devices: list[Any]) -> Any:
-    """Load a cached program; None if there is none that is intact and this user's own."""
+    """Load a cached program; None if it is absent, damaged or not this user's."""
     try:
         data = path.read_bytes()
         if not _is_ones_own(path) or hashlib.sha256(data[_DIGEST:]).digest() != data[:_DIGEST]:

@@ -200,7 +200,7 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
     """
     path = pathlib.Path(path)
     if path.name in ("", "-"):
-        raise InputError(f"{path}: found no name of a file, expected one")
+        raise InputError(f"{path}: found no file name, expected one")
     if suffix is not None and path.suffix != suffix:
         raise InputError(f"{path}: found the suffix {path.suffix!r}, expected {suffix}")
     _check_place(path, _FILE, "a file or nothing yet")
@@ -225,7 +225,7 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
     path = pathlib.Path(path)
     _check_place(path, _FOLDER, "a new or empty folder")
     if path.exists() and path.samefile(os.curdir):
-        raise InputError(f"{path}: found the folder that this runs in, expected another")
+        raise InputError(f"{path}: found the working directory, expected another folder")
     if path.exists() and any(path.iterdir()):
         raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
 
@@ -305,12 +305,12 @@ def atomic_path(
 ) -> Iterator[pathlib.Path]:
     """Yield a temporary path next to `path`; rename it to `path` on success, else remove it.
 
-    The temporary name keeps the suffix, for writers that choose a format by it. Parent folders are
+    The temporary name has the same suffix, from which writers choose a format. Parent folders are
     made as needed.
 
     Args:
         path: the file.
-        within: a folder on the same disk for the temporary file, which its owner clears; None is
+        within: a folder on the same disk, cleared by its owner, for the temporary file; None is
             the folder of `path`.
         durable: whether to sync the file to disk, so that it survives a power failure.
 

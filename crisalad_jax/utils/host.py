@@ -37,6 +37,6 @@ def available_memory() -> int:
 
 
 def most_files() -> int:
-    """Return how many files this process may have open, connections among them."""
+    """Return how many files this process may have open, including connections."""
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return 2**20 if files == resource.RLIM_INFINITY else files

@@ -107,7 +107,7 @@ def download_file(
 def upload_folder(
     folder: pathlib.Path, address: HubAddress, message: str, *, quiet: bool = False
 ) -> str:
-    """Upload a folder to a new repository of models, or to one that has no files yet.
+    """Upload a folder to a new repository of models, or to one without files of the same names.
 
     Args:
         folder: the folder.
@@ -119,7 +119,7 @@ def upload_folder(
         The address of the repository's page.
 
     Raises:
-        InputError: the repository has a model; the user is not logged in or may not write there;
+        InputError: the repository has such files; the user is not logged in or may not write there;
             or the hub does not answer.
         ModuleNotFoundError: huggingface_hub is not installed.
     """
@@ -151,7 +151,7 @@ def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -
 
     Args:
         handle: the data set, as OWNER/NAME.
-        folder: a folder for its client's cache, from which the next call resumes.
+        folder: a folder for the cache of Kaggle's client, from which the next call resumes.
         quiet: whether to hide the progress bar.
 
     Returns:
@@ -196,7 +196,7 @@ def _told(address: HubAddress) -> Iterator[None]:
 
     absent = f"{OFFLINE} forbids the network" if is_offline() else "the hub does not answer"
     known = {  # the first that fits: some are subclasses of others
-        errors.GatedRepoError: "a repository with terms, expected you to accept them at its page",
+        errors.GatedRepoError: "a gated repository, expected you to accept the terms on its page",
         errors.RepositoryNotFoundError: "no such repository, or a private one, expected one",
         errors.RevisionNotFoundError: "no such revision, expected one",
         errors.LocalEntryNotFoundError: f"none in the hub's cache: {absent}",

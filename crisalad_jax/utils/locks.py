@@ -38,7 +38,7 @@ def lock(folder: str | os.PathLike[str], *, wait: float = 0.0) -> Iterator[None]
         wait: seconds to wait for another process that holds it, with a warning.
 
     Raises:
-        InputError: another process holds it, and the message says which, on which host; or the
+        InputError: another process holds it (the message names it and its host); or the
             folder cannot be made or written to.
     """
     folder = pathlib.Path(folder)

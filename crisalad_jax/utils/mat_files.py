@@ -1,4 +1,4 @@
-"""Read MATLAB's `.mat` files with scipy, which runs no code of them."""
+"""Read MATLAB's `.mat` files with scipy, which runs no code in them."""
 
 import os
 import struct

@@ -77,7 +77,7 @@ def one_line(error: object) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a count with its noun, which has an s for any other number than one.
+    """Return a count with its noun, which has an s for any number other than one.
 
     Example:
         >>> counted(1, "image"), counted(2, "image")

@@ -1,4 +1,4 @@
-"""Progress on the terminal: a bar with rate and time left, on stderr, silent when asked."""
+"""Progress on the terminal: a bar with rate and time left, on stderr, unless quiet."""
 
 import contextlib
 import functools
@@ -40,7 +40,7 @@ def progress_bar(
         total: number of units.
         unit: name of the unit, for the rate.
         quiet: whether to show nothing.
-        done: units that were done before, which do not count for the rate.
+        done: units that were done before, which do not count towards the rate.
     """
     if quiet:
         yield Bar()

@@ -76,7 +76,7 @@ def check_drawn(tree: Any, where: str) -> None:
             path = f" {name}" if name else ""
             raise InputError(f"{where}: found parameter{path} of type {dtype}, expected float32")
         if not leaf.size:
-            raise InputError(f"{where}: found no numbers in parameter {name}, expected None")
+            raise InputError(f"{where}: found an empty parameter {name}, expected None")
 
 
 def expect_like(name: str, found: Any, wanted: Any) -> None:

@@ -47,7 +47,7 @@ _pipe = -1
 
 
 def watch() -> None:
-    """Watch for signals in a second thread; repeat it before a library works in the main thread.
+    """Watch for signals in a second thread; call again before a library works in the main thread.
 
     orbax writes with uvloop, which takes over the watching, and does not give it back.
     """
@@ -124,10 +124,10 @@ class SignalState:
     """The state of deferred signals: whether a signal has arrived."""
 
     current: "SignalState | None" = None
-    """The state while signals are deferred, and after one was."""
+    """The state while signals are deferred, and after a signal has arrived."""
 
     def __init__(self, before: Mapping[Any, Any] | None = None) -> None:
-        """Start without a signal; `before` are the handlers of signals until now."""
+        """Start without a signal; `before` has the earlier handlers by signal."""
         self.number = 0
         """Number of the last signal; 0 for none."""
         self.has_work = False
@@ -136,7 +136,7 @@ class SignalState:
         self._before = before or {}
 
     def check(self) -> None:
-        """Raise `Interrupted` if a signal has come."""
+        """Raise `Interrupted` if a signal has arrived."""
         if self.number:
             raise Interrupted(self.number)
 
@@ -151,7 +151,7 @@ class SignalState:
             self._at_once = False
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Record a signal, as its handler; a second one interrupts without waiting."""
+        """Handle a signal by recording it; a second one interrupts without waiting."""
         first, self.number = self.number == 0, number
         earlier = self._before.get(number)
         if earlier is _end and not self.has_work:

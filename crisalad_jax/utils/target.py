@@ -18,7 +18,7 @@ _LOWERED_AS = {"cpu": "cpu", "gpu": "cuda", "tpu": "tpu"}
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A platform, and its properties that the choices of a program depend on.
+    """A platform, and the properties that a program's choices depend on.
 
     Example:
         >>> GPU.product_dtype("bfloat16"), CPU.product_dtype("bfloat16")
@@ -47,7 +47,7 @@ PORTABLE = Target("portable")
 """No platform-dependent choices: a program runs on all platforms."""
 STRAIGHT = Target("portable", branches=False)
 """No platform-dependent choices and no branches: a program of another format, for any engine."""
-# JAX's trace cache depends on it: a function traced for one target is traced again for another.
+# JAX's trace cache depends on this: a function traced for one target is traced again for another.
 _chosen = jax.make_user_context(None)
 _mesh = jax.make_user_context(None)
 _ONE_DEVICE = AbstractMesh((1,), ("image",), axis_types=(AxisType.Auto,))

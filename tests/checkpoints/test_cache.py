@@ -252,7 +252,7 @@ def test_faults_leave_no_model(model, server, tmp_path):
         (safetensors.numpy.save({"x": np.zeros(3, np.float32)}), "found no checkpoint that we"),
         (
             state_bytes(0, with_backbone(dim=128, heads=2)),
-            r"found descriptors of 128 numbers and \d+ parameters \(huggingface\), expected 64 and",
+            r"found 128 dimensions and \d+ parameters \(huggingface\), expected 64 and",
         ),
     ],
     ids=["cut", "a page", "of no layout", "of another size"],
@@ -324,7 +324,7 @@ def test_a_mirror_is_asked_first(model, server, monkeypatch, tmp_path, kind):
     folder.mkdir()
     mirror = server.url("/mirror") if kind == "http" else folder.as_uri()
     monkeypatch.setenv("CRISALAD_MIRROR", f"{mirror}/")
-    with pytest.warns(Note, match=f"{FILE}: found no such file; looking at {model.url}"):
+    with pytest.warns(Note, match=f"{FILE}: found no such file; trying {model.url}"):
         cj.load("tiny-model")
     published = cached_weights(model).with_name(FILE)
     for path in published.parent.iterdir():

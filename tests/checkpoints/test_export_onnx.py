@@ -318,7 +318,7 @@ def test_eight_bits_of_a_program_that_takes_one_number_of_images(
     params: Crisalad, tmp_path: pathlib.Path
 ):
     how = ExportConfig(format="onnx", batch_size=2)
-    with pytest.raises(InputError, match=r"^int8: found with format stablehlo, grouping any"):
+    with pytest.raises(InputError, match=r"^int8: found format stablehlo, grouping any"):
         write_export(tmp_path / "out", Model(params, MODEL), how, calibration=pictures(2))
 
 

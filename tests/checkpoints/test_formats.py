@@ -183,7 +183,7 @@ def bare_salad(**fields: Any) -> ModelConfig:
 def test_another_dustbin_is_no_dino_salad() -> None:
     config = bare_salad(dustbin="token")
     with pytest.raises(
-        InputError, match=r"format dino-salad: these cannot be distinguished .*dustbin.*token"
+        InputError, match=r"format dino-salad: cannot store settings .*dustbin.*token"
     ):
         check_holds(config, "dino-salad")
 

@@ -119,7 +119,7 @@ models = [{ name = "NAME", descriptor = 1, parameters = 1, file = "town.pth" }]
         ("town", "found no TOML: "),
         ("[[family]]", "cannot be read: 'models'"),
         (FAMILY.replace("FORMAT", "cosplace").replace("NAME", "megaloc"), "found megaloc, a name"),
-        (FAMILY.replace("FORMAT", "vlad"), "NAME: found format 'vlad', expected one of its own or"),
+        (FAMILY.replace("FORMAT", "vlad"), "NAME: found format 'vlad', expected one that the text"),
         (FAMILY.replace("paper", "papers"), "cannot be read: .*'papers'"),
         (FAMILY.replace("MIT", "Town"), "licence: found 'Town', expected one of Apache-2.0, "),
         (FAMILY.replace("descriptor = 1", "descriptor = 'x'"), "Published.descriptor: found 'x'"),

@@ -111,7 +111,7 @@ def test_training_from_another_size_or_kind(capfd, tmp_path):
     )
     fails(capfd, *train, "--weights", ours, "--model.backbone.dim", 128, words=words)
     resnet = save(tmp_path / "cosplace.pth", cosplace())
-    words = "this backbone is another than the model's: backbone: found resnet, expected vit"
+    words = "this backbone differs from the model's: backbone: found resnet, expected vit"
     with pytest.raises(InputError, match=f"^{resnet}: {words}"):
         read_backbone(resnet, SALAD.backbone, None)
     assert not (tmp_path / "run").exists()

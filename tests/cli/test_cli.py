@@ -449,7 +449,7 @@ def test_convert_says_what_it_found(capfd, tmp_path, public):
     ours, back = tmp_path / "w.safetensors", tmp_path / "back.pth"
     out = succeeds(capfd, "convert", public, ours)
     assert f"{public} (DINOv2 .pth) -> {ours} (crisalad-jax): backbone of width 64, 2 blocks" in out
-    assert "descriptor of 64 numbers" in out
+    assert "descriptor of 64 dimensions" in out
     assert load_weights(ours)[1] == BACKBONE
     out = succeeds(capfd, "convert", ours, back)
     assert f"(crisalad-jax) -> {back} (DINOv2 .pth)" in out
@@ -603,7 +603,7 @@ def test_extract_writes_descriptors_names_and_configuration(
 ):
     town = shared / "town"
     out = succeeds(capfd, *extract(shared, town, tmp_path / "new" / "d.npy"))
-    assert "12 descriptors of 48 numbers, grouping single (each image independently)" in out
+    assert "12 descriptors of 48 dimensions, grouping single (each image independently)" in out
     assert files_in(tmp_path / "new") == {"d.npy", "d.names.txt", "d.npy.json"}
     names = (tmp_path / "new" / "d.names.txt").read_text().splitlines()
     assert names == sorted(path.relative_to(town).as_posix() for path in town.rglob("*.jpg"))

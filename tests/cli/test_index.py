@@ -54,7 +54,7 @@ def test_a_map_is_made_grown_and_asked(shared, database, queries, tmp_path, capf
         (part / path.name).symlink_to(path)
     stored = ("--store", store.format(map=out))
     said = succeeds(capfd, *index(shared, part, out, *stored))
-    assert f"{out}: 2 images added, 2 with positions; 2 descriptors of 48 numbers" in said
+    assert f"{out}: 2 images added, 2 with positions; 2 descriptors of 48 dimensions" in said
     said = succeeds(capfd, *index(shared, database, out))
     assert "5 images added, 5 with positions; 2 were there already; 7 descriptors" in said
     assert "7 were there already" in succeeds(capfd, *index(shared, database, out, *stored))
@@ -168,7 +168,7 @@ def test_a_map_moved_without_its_weights_and_images_is_told_where_they_are(
     fails(capfd, *asked, words=(f"found no {weights}, which made this map", "--weights"))
     asked = (*asked, "--weights", shared / "weights.safetensors")
     _, error = runs(capfd, *asked)
-    assert error.startswith(f"crisalad: note: 7 pictures shown as a grey box, as of {images}/")
+    assert error.startswith(f"crisalad: note: 7 pictures shown as a grey box (first: {images}/")
     succeeds(capfd, *asked, "--map-images", tmp_path / "elsewhere")
     assert files_in(tmp_path / "moved") == {
         *("map.json", "segments/0000000000.json", "segments/0000000000.npy")
@@ -202,7 +202,7 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd, weights):
 
 def test_a_long_fact_is_cut_after_ten_rows():
     lines = list(fact_lines({"folders": [{"folder": str(i)} for i in range(12)], "map": None}))
-    assert lines[9:] == ["         folder 9", "         and 2 more", "map      not said"]
+    assert lines[9:] == ["         folder 9", "         and 2 more", "map      not given"]
 
 
 def test_positions_come_from_a_table(shared, database, tmp_path, capfd):
@@ -212,7 +212,7 @@ def test_positions_come_from_a_table(shared, database, tmp_path, capfd):
     out = tmp_path / "map"
     said = succeeds(capfd, *index(shared, database, out, "--positions", table))
     assert "7 images added, 1 with positions" in said
-    assert "1 positions given are of no image here, 'other.jpg' the first" in said
+    assert "1 given positions match no image here, 'other.jpg' the first" in said
     with Map.open(out) as found:
         assert found.axes == ("lat", "lon")
         assert [image.position for image in found.images][:3] == [None, (1.5, -2.5), None]
@@ -274,7 +274,7 @@ def test_positions_of_images_that_are_there_are_said_to_stay(
     known = list_images(database)
     table.write_text(f"name,east,north\n{known[0].name},1,2\n{known[1].name},3,4\nno.jpg,5,6\n")
     made = index(shared, database, folder, "--positions", table)
-    assert "2 positions given are of such, and stay as they are" in succeeds(capfd, *made)
+    assert "2 given positions ignored, as the map has these images" in succeeds(capfd, *made)
     with Map.open(folder) as found:
         assert found.images[0].position not in ((1.0, 2.0), None)
     images = tmp_path / "images"

@@ -255,7 +255,7 @@ def test_json_on_stdout_is_what_the_last_line_says(capfd, tmp_path, database, we
     common = ("--images", database, "--weights", weights, "--batch-size", BATCH, "--quiet")
     found, words = printed(capfd, "extract", *common, "--out", tmp_path / "d.npy", "--json", "-")
     assert (found["descriptors"], found["length"], found["skipped"]) == (7, 48, [])
-    assert f"{tmp_path / 'd.npy'}: 7 descriptors of 48 numbers" in words
+    assert f"{tmp_path / 'd.npy'}: 7 descriptors of 48 dimensions" in words
     found, words = printed(capfd, "index", *common, "--out", tmp_path / "map", "--json", "-")
     assert (found["added"], found["positions"], found["images"], found["length"]) == (7, 7, 7, 48)
     assert "7 images added" in words

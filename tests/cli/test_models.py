@@ -58,7 +58,7 @@ def test_the_table_has_every_model_and_marks_those_in_the_cache(capfd, tmp_path)
 def test_one_model_is_told_with_all_that_is_known(capfd):
     out, _ = runs(capfd, "models", "tiny-model")
     facts = dict(line.split(maxsplit=1) for line in out.splitlines())
-    known = {"parameters": "88,640", "images": "56 x 56", "file": FILE, "url": "not said"}
+    known = {"parameters": "88,640", "images": "56 x 56", "file": FILE, "url": "not given"}
     known |= {"backbone": "-", "licence": "no licence file", "cached": "no"}
     assert facts.items() >= known.items()
 

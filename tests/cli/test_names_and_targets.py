@@ -73,4 +73,4 @@ def test_an_export_does_not_take_the_place_of_the_working_folder(
 ):
     monkeypatch.chdir(tmp_path)
     start = ("export", "--weights", weights, "--out", ".")
-    fails(capfd, *start, words=(".: found the folder that this runs in, expected another",))
+    fails(capfd, *start, words=(".: found the working directory, expected another",))

@@ -49,7 +49,7 @@ def test_extract_writes_shorter_descriptors(capfd, tmp_path, shared):
     fitted = fit_pca(whole, 5)
     save_pca(components, fitted)
     out = succeeds(capfd, *extract(shared, town, tmp_path / "s.npy", "--pca", components))
-    assert "12 descriptors of 5 numbers" in out
+    assert "12 descriptors of 5 dimensions" in out
     np.testing.assert_array_equal(np.load(tmp_path / "s.npy"), fitted.apply(whole))
     config = json.loads((tmp_path / "s.npy.json").read_text())
     assert config["pca"] == str(components)
@@ -95,11 +95,11 @@ def test_components_become_the_last_layer_of_a_model(capfd, tmp_path, shared, we
     np.testing.assert_allclose(np.load(tmp_path / "s.npy"), expected, atol=1e-4, rtol=0)
 
     again = (*fit[:-1], model, "--dim", 2, "--out", tmp_path / "twice.safetensors", "--quiet")
-    fails(capfd, *again, words=(f"{model}: found a model with a projection to 4 numbers",))
+    fails(capfd, *again, words=(f"{model}: found a model with a projection to 4 dimensions",))
     plain = tmp_path / "plain.safetensors"
     succeeds(capfd, *fit, "--no-renormalise", "--dim", 4, "--out", plain, "--quiet")
     index = ("index", "--images", town, "--weights", plain, "--out", tmp_path / "map", "--quiet")
-    fails(capfd, *index, words=(f"{plain}: found descriptors whose lengths are left",))
+    fails(capfd, *index, words=(f"{plain}: found descriptors that are not normalised",))
     assert not (tmp_path / "map").exists()
 
 

@@ -24,7 +24,7 @@ def test_a_world_that_is_there_stays_and_another_is_refused_by_what_differs(tmp_
     given = ("render", "--out", tmp_path / "world", *SMALL, "--quiet")
     succeeds(capfd, *given)
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    assert "there already, 6 places with 4 images each" in succeeds(capfd, *given)
+    assert "already rendered, 6 places with 4 images each" in succeeds(capfd, *given)
     for flag, value, words in (
         ("--repaint", "0.2", "another configuration (repaint: 0.3, not 0.2)"),
         ("--varied", "season", "another configuration (varied: ['stand', "),

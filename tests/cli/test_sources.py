@@ -169,7 +169,7 @@ def test_a_pattern_and_a_window_of_queries(town_map, tmp_path, capfd, queries):
 def test_the_default_rate_of_a_video_is_said(shared, town_map, tmp_path, capfd):
     """Of 21 frames in 2.1 seconds three are taken: at 0, 1 and 2 s."""
     video = write_video(tmp_path / "walk.avi", 21)
-    said = f"crisalad: note: {video}: 3 of 21 frames, 1 per second: --fps\n"
+    said = f"crisalad: note: {video}: took 3 of 21 frames, 1 per second (--fps)\n"
     start, out = tmp_path / "start.safetensors", tmp_path / "v.safetensors"
     save_weights(start, Model(random_params(ANYLOC), ANYLOC))
     verbs = (
@@ -184,7 +184,7 @@ def test_the_default_rate_of_a_video_is_said(shared, town_map, tmp_path, capfd):
     write_video(tmp_path / "slow.avi", 3, rate=1)
     (tmp_path / "list.txt").write_text("walk.avi\nslow.avi\n")
     _, error = runs(capfd, *query(town_map, tmp_path / "list.txt"))
-    assert "list.txt: 6 of 24 frames, 1 per second: --fps\n" in error
+    assert "list.txt: took 6 of 24 frames, 1 per second (--fps)\n" in error
     succeeds(capfd, *query(town_map, video, "--fps", 1))
     succeeds(capfd, *query(town_map, tmp_path / "slow.avi"))
     succeeds(capfd, *query(town_map, f"{video}#t=0.5"))

@@ -28,7 +28,7 @@ def test_it_leaves_a_whole_model(capfd, shared, tmp_path):
     save_weights(start, Model(fresh, ANYLOC))
     command = ("vocabulary", "--weights", start, "--images", shared / "town", "--out", out)
     said = succeeds(capfd, *command, "--seed", 3, "--batch-size", BATCH, "--quiet")
-    assert said == f"{out}: anyloc, 4 words from 12 images {AT}, descriptors of 128 numbers"
+    assert said == f"{out}: anyloc, 4 words from 12 images {AT}, descriptors of 128 dimensions"
     found, config = load_weights(out)
     assert config == ANYLOC
     paths = list_images(shared / "town")
@@ -48,7 +48,7 @@ def test_a_preset_and_a_backbone(capfd, shared, tmp_path):
         *("--clusters", 3, "--image-size", 42, 56, "--images", shared / "town", "--out", out),
         *("--max-images", 4, "--batch-size", BATCH, "--quiet"),
     )
-    assert said == f"{out}: netvlad, 3 words from 4 images {AT}, descriptors of 384 numbers"
+    assert said == f"{out}: netvlad, 3 words from 4 images {AT}, descriptors of 384 dimensions"
     found, found_config = load_weights(out)
     assert (found_config.image_size, found_config.aggregator.clusters) == ((42, 56), 3)
     assert_equal(found.backbone, params.backbone)
@@ -120,7 +120,7 @@ def test_a_plug_ins_aggregator(capfd, shared, tmp_path):
     words = "--facet: found with --aggregator bag-of-words, which has no such setting, expected one"
     fails(capfd, *start, "--facet", "key", words=(words, "clusters, layer"))
     said = succeeds(capfd, *start, "--clusters", 5, "--layer", 2, "--image-size", 42, 56)
-    assert said == f"{out}: bag-of-words, 5 words from 12 images {AT}, descriptors of 5 numbers"
+    assert said == f"{out}: bag-of-words, 5 words from 12 images {AT}, descriptors of 5 dimensions"
     params, config = load_weights(out)
     assert (config.aggregator.clusters, config.aggregator.layer) == (5, 2)
     paths = list_images(shared / "town")

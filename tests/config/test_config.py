@@ -271,7 +271,7 @@ def test_the_recipes_over_resnet_are_as_published():
 
 
 def test_a_part_alone_is_told():
-    with pytest.warns(Note, match=r"^recipe: found gem, which is a part: crisalad\+gem, CriS"):
+    with pytest.warns(Note, match=r"^recipe: found part gem; using crisalad\+gem, CriS"):
         assert recipe("tiny", "gem") == recipe("tiny", "crisalad+gem")
     swapped = recipe("b14", "salad+step:newton")
     assert swapped.model.aggregator.sinkhorn.step.part_name == "newton"
@@ -359,7 +359,7 @@ def test_more_patches_than_clusters(clusters, side):
         (ViTConfig, {"dim": 6, "heads": 1, "position_init": "sincos"}, "dim: found 6, .* of 4"),
         (ViTConfig, NARROW, "found 0.25, expected a width for dim 96, 24, .* of 16"),
         (ModelConfig, {"aggregator": "gem-pyramid", "image_size": (28, 56)}, "at least 42 x 42, a"),
-        (ModelConfig, {"aggregator": "anyloc"}, "for aggregator anyloc, with which nothing trains"),
+        (ModelConfig, {"aggregator": "anyloc"}, "for aggregator anyloc, which cannot be trained"),
         (ModelConfig, {"aggregator": ConvApConfig(side=3), "image_size": (28, 56)}, "42 x 42, a p"),
         (ModelConfig, {"aggregator": SaladConfig(token_dim=200)}, "token: found True, expected F"),
         (BoqConfig, {"channels": 200}, "found 200, expected a multiple of its 3 heads, one for"),

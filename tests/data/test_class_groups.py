@@ -233,7 +233,7 @@ ROW = [(100.0 * i, 0.0) for i in range(9)]
             (city_of(ROW, [3] * 9), {"kind": kind}, "found 0 classes of at least 4 images")
             for kind in ("cells", "viewpoints", "places")
         ),
-        (city_of(ROW, [4] * 9), {"groups": 2}, "found 4 classes of .* places_per_batch 5; fewer"),
+        (city_of(ROW, [4] * 9), {"groups": 2}, "found 4 classes of .* places_per_batch 5; lower"),
         (city_of([(0, 0)] * 4, [1] * 4), {"kind": "cells"}, "found .*one position for all images"),
         (located((0, 1, np.nan), (1, 2, np.nan)), {"kind": "cells"}, "found no headings"),
         (located((0, -60, 0), (0, 100, 0)), {}, "found the images of city0 over 160 degrees"),

@@ -178,7 +178,7 @@ def test_a_video_trains_as_its_frames(tmp_path, cache):
         assert abs(first - second) > 1
 
 
-UNFIT = "^.*walk: found arguments that do not fit each other, expected --cities for the layout of G"
+UNFIT = "^.*walk: found conflicting arguments, expected --cities for the layout of G"
 
 
 @pytest.mark.parametrize(
@@ -287,7 +287,7 @@ def test_a_table_may_be_of_several_cities(folders):
     assert abs(views.east[0] - views.east[1]) == pytest.approx(10_460, rel=1e-2)
     assert abs(views.north[2] - views.north[3]) == pytest.approx(11_140, rel=1e-2)
     _write_table(folders / "places.csv", "name,place,lat,lon", [row[:4] for row in rows])
-    with refused("expected at most 60, .* a set of several cities has a column city"):
+    with refused("expected at most 60, .* a set of several cities needs a column city"):
         views_of(read_places(folders, min_images=1))
 
 

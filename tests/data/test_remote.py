@@ -89,8 +89,8 @@ def test_lists_and_tables_of_addresses(memory, tmp_path):
     assert open_source(tmp_path / "some.csv").positions == Positions(("x", "y"), {"a.png": (1, 2)})
     for line, words in (
         ("memory://else/a.png", "addresses of memory://else and memory://run, expected those of"),
-        ("a.png", "found a.png with addresses"),
-        ("memory://run/walk.mp4", "found memory:/run/walk.mp4 with addresses, expected images"),
+        ("a.png", "found a.png among addresses"),
+        ("memory://run/walk.mp4", "found memory:/run/walk.mp4 among addresses, expected images"),
     ):
         (tmp_path / "some.txt").write_text(f"memory://run/a.png\n{line}\n")
         with refused(f"some.txt: .*{words}"):

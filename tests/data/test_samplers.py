@@ -250,7 +250,7 @@ def test_images_may_be_chosen_one_by_one():
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        (np.array([0.0, 1.0]), r"found float64 of shape \(2,\), expected numbers of places"),
+        (np.array([0.0, 1.0]), r"found float64 of shape \(2,\), expected indices of places"),
         (
             np.zeros((2, 3, 2), int),
             r"found int64 of shape \(2, 3, 2\), .* in the shape \(steps, 4, 3\)",

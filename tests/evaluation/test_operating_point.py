@@ -76,7 +76,7 @@ def test_the_bound_is_where_the_binomial_says(right, answered):
 
 def test_how_many_answers_a_precision_takes():
     (rarer,) = caveats(OperatingPoint(0.99, 0.5, 29, 29, 40, 0, 0))
-    assert rarer.endswith("99 % takes 299 answers, all of them right")  # 0.99 ** 298 is 0.05003
+    assert rarer.endswith("99 % takes 299 answers, all of them correct")  # 0.99 ** 298 is 0.05003
     (certain,) = caveats(OperatingPoint(1.0, 0.5, 29, 29, 40, 0, 0))
     assert certain.endswith("(95 % confidence)")  # no number of answers shows that
     many = OperatingPoint(0.9, 0.5, 29, 29, 40, 0, 0)
@@ -84,9 +84,9 @@ def test_how_many_answers_a_precision_takes():
     (words,) = caveats(many._replace(answered=28, right=28))
     (mixed,) = caveats(OperatingPoint(0.3, 0.5, 53, 16, 111, 0, 0))
     assert mixed.endswith("which shows a precision of at least 19.9 % (95 % confidence)")
-    assert words.startswith("rests on few queries: 28 of 28 answers were right, which shows a")
+    assert words.startswith("rests on few queries: 28 of 28 answers were correct, which shows")
     assert words.endswith(
-        "at least 89.9 % (95 % confidence); 90 % takes 29 answers, all of them right"
+        "at least 89.9 % (95 % confidence); 90 % takes 29 answers, all of them correct"
     )
 
 

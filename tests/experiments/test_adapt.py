@@ -247,7 +247,7 @@ def test_the_recall_before_is_that_of_the_maps_model(folder, tmp_path) -> None:
     ("given", "words"),
     [
         ({"weights": "other"}, "found a map made by model"),
-        ({"config": ANOTHER}, "the map's model is another"),
+        ({"config": ANOTHER}, "the map has another model"),
         ({"gone": "Brill"}, "gone, expected the image of"),
         ({"place_radius": 5.0}, "--place-radius: found 5.0 for a map without positions"),
         ({"most_lost": 1.5}, "--most-lost: found 1.5, expected 0 to 1"),

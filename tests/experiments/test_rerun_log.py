@@ -171,7 +171,7 @@ def test_a_map_without_positions_has_no_map(answers, tmp_path):
 def test_pictures_of_the_map_that_are_gone_are_left_out(answers, tmp_path):
     images = [image._replace(root="/nowhere") for image in answers.images]
     moved = answers._replace(images=images)
-    words = "6 pictures left out, as of /nowhere/.*--map-images"
+    words = r"6 pictures left out \(first: /nowhere/.*\); --map-images"
     with pytest.warns(Note, match=words), record(tmp_path / "a.rrd") as recording:
         recording.add(moved)
     assert len(read(tmp_path / "a.rrd")["/query"]) == 2

@@ -177,7 +177,7 @@ def test_the_width_of_pieces_divides_the_descriptor() -> None:
     ):
         dataclasses.replace(SAGE, cross_image=SageCrossImageConfig(width=13))
     with pytest.raises(
-        cj.InputError, match=r"heads: found 16, expected a divisor of the 12 numbers"
+        cj.InputError, match=r"heads: found 16, expected a divisor of the 12 dimensions"
     ):
         dataclasses.replace(SAGE, cross_image=SageCrossImageConfig(width=12))
     published = cj.ModelConfig(cross_image="sage-encoder")

@@ -155,7 +155,7 @@ def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
     ("part", "width"), [(ConvApConfig(channels=100), 100), (BoqConfig(channels=72), 72)]
 )
 def test_tokens_that_do_not_fit_the_encoder(part: Aggregator, width: int) -> None:
-    words = f"^CrossImageConfig.heads: found 16, expected a divisor of the {width} numbers"
+    words = f"^CrossImageConfig.heads: found 16, expected a divisor of the {width} dimensions"
     with pytest.raises(InputError, match=words):
         ModelConfig(aggregator=part)
     bare = ModelConfig(aggregator=part, cross_image="none")

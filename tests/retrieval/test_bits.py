@@ -83,7 +83,7 @@ def test_bits_and_numbers_are_told_apart():
             search(database, queries, 1)
     with pytest.raises(InputError, match=r"^database: found packed bits .uint8., expected"):
         to_unit_vectors(bits, bits)
-    with pytest.raises(InputError, match=r"^descriptors: found 12 numbers, expected a multiple"):
+    with pytest.raises(InputError, match=r"^descriptors: found 12 dimensions, expected a multiple"):
         pack_bits(draw(2, 12))
     rows[2, 3] = np.nan
     with pytest.raises(InputError, match=r"^descriptors: row 2 is not finite"):

@@ -156,7 +156,7 @@ def test_the_same_call_does_the_rest_with_the_same_bits(
         *(f"{name}{suffix}" for name in kept for suffix in (".json", ".npy"))
     }
     if error is InputError:
-        advice = f"what is done is stored in {out}.partial: the same command resumes"
+        advice = f"finished work is stored in {out}.partial: the same command resumes"
         assert str(found) == f"cut short ({advice})"
     described.clear()
     result = run(params, town, out)
@@ -218,7 +218,7 @@ def test_an_image_that_is_skipped_is_skipped_again(params, town, described, tmp_
     # Where it is an error, it is one however much is done.
     cut_short(monkeypatch, params, images, out, after=2, on_bad_image="skip")
     with pytest.raises(
-        InputError, match=rf"{bad.name}.* \(what is done is stored in {out}\.partial"
+        InputError, match=rf"{bad.name}.* \(finished work is stored in {out}\.partial"
     ):
         run(params, images, out)
 
@@ -244,7 +244,7 @@ def test_what_is_damaged_is_described_again(
         run(params, town, out)
     assert described == names_from(town, 0)
     (note,) = (str(one.message) for one in told if issubclass(one.category, Note))
-    assert "starts again" in note
+    assert "starting again" in note
     assert contents(tmp_path) == whole
 
 
@@ -283,7 +283,7 @@ def test_other_work_is_begun_anew_with_a_note(
         params = jax.tree.map(lambda leaf: leaf * 0.9, params)
     listed = {"fewer": listed[:-1], "order": listed[::-1]}.get(other, listed)
     described.clear()
-    words = r"d\.npy\.partial: found work of another model, batch size or images; the work"
+    words = r"d\.npy\.partial: found results for another model, batch size or images; starting"
     with pytest.warns(Note, match=words) as told:
         found = run(params, listed, out)
     assert described == [path.name for path in listed]

@@ -75,7 +75,7 @@ def test_windows_that_mean_nothing_are_refused(town):
     with pytest.raises(InputError, match="window: found 0, expected at least 1"):
         FrameDescriber(town.describer, 0)
     alone = types.SimpleNamespace(config=dataclasses.replace(MODEL, cross_image="none"))
-    with pytest.raises(InputError, match="window: found 2, expected 1 of a model without a cross"):
+    with pytest.raises(InputError, match="window: found 2, expected 1 for a model without a cross"):
         FrameDescriber(alone, 2)
     FrameDescriber(alone, 1)
 

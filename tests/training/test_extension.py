@@ -56,7 +56,7 @@ def test_a_learning_rate_over_the_whole_run_jumps_and_a_note_says_so(
 ):
     longer = dataclasses.replace(RECIPE, patience=None, epochs=4)
     fail_at(monkeypatch, "train_step", 1)  # nothing of it is compiled
-    note = "jumps at step 6: this is not the run of 4 epochs at once"
+    note = "jumps at step 6, unlike in a run of 4 epochs from the start"
     with pytest.warns(Note, match=note), pytest.raises(Interrupted):
         fit(longer, places, copied, validation=benchmark, initial=params, quiet=True)
     assert read_config(TrainConfig, copied / "config.json") == longer

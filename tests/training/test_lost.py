@@ -99,7 +99,7 @@ def test_an_exchange_that_failed_is_a_line(leaving, error, lost_one):
         exchange(error)
     assert len(leaving) == lost_one
     if lost_one:
-        assert str(caught.value).startswith("processes: lost another one (")
+        assert str(caught.value).startswith("processes: lost another process (")
         assert "\n" not in str(caught.value)
 
 

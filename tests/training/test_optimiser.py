@@ -52,7 +52,7 @@ SHARED = OptimiserConfig(warmup_epochs=10, accumulate=4)
         (OptimiserConfig(warmup_steps=30), 3, 1, "steps: found 30 steps for a run of 3, .* 0", 0),
         (OptimiserConfig(warmup_steps=9), 36, 1, None, None),
         (OptimiserConfig(), 1, 1, None, None),
-        (BOQ, 5 * 7, 7, "epochs: found 70 steps for a run of 35, which leaves 0 at", 8),
+        (BOQ, 5 * 7, 7, "epochs: found 70 steps for a run of 35, which leaves 0 after", 8),
         (BOQ, 40 * 7, 7, None, None),
         (SHARED, 20 * 7, 7, "epochs: found 20 steps for a run of 40, which leaves 20", 10),
     ],
@@ -236,5 +236,5 @@ def test_no_built_in_parts_parameter_is_an_array_of_no_numbers():
             lambda key, p=part: p.init(key, backbone, (16, 16)), jax.random.key(0)
         )
         check_drawn(made, name)
-    with pytest.raises(InputError, match=r"^mine: found no numbers in parameter a, expected None$"):
+    with pytest.raises(InputError, match=r"^mine: found an empty parameter a, expected None$"):
         check_drawn({"a": np.zeros((0, 3), np.float32)}, "mine")

@@ -75,7 +75,7 @@ def test_another_server_there(scheme):
         threading.Thread(target=server.accept, daemon=True).start()
         command = [sys.executable, "-c", OTHER_SERVER, address]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.stdout == f"--cluster {address}: found no answer of a Ray cluster within 5 s\n"
+    assert done.stdout == f"--cluster {address}: found no answer from a Ray cluster within 5 s\n"
     assert len(done.stderr.splitlines()) <= 1  # a warning of Ray's, which it writes itself
 
 

@@ -55,7 +55,7 @@ def test_an_untested_jax_is_said_in_one_line(
     lines = [line for line in printed if "jax" in line]
     assert len(lines) == warned
     for line in lines:
-        assert line.startswith(f"crisalad: note: found jax {version}, tested are 0.10 and 0.12: ")
+        assert line.startswith(f"crisalad: note: found jax {version}, tested with 0.10 and 0.12: ")
 
 
 @pytest.mark.parametrize("chosen", [CPU, GPU, TPU, PORTABLE], ids=lambda chosen: chosen.platform)

@@ -147,7 +147,7 @@ def test_only_an_empty_folder_is_replaced(tmp_path: pathlib.Path, monkeypatch: p
     empty.mkdir()
     file.write_text("")
     monkeypatch.chdir(empty)
-    with pytest.raises(InputError, match=f"^{empty}: found the folder that this runs in"):
+    with pytest.raises(InputError, match=f"^{empty}: found the working directory"):
         check_new_folder(empty)
     monkeypatch.chdir(tmp_path)
     with atomic_folder(empty) as temporary:

@@ -29,33 +29,33 @@ from crisalad_jax.utils.output import one_line, warn
 from crisalad_jax.utils.pytree import named_leaves
 
 VOCABULARY = "anyloc-words"
-"""Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023): only the words."""
+"""Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023), with only the words."""
 REFERENCE = "reference"
 """Name of the format of our torch reference."""
 
 
 def _with_squares(state: State, config: ModelConfig) -> ModelConfig:
-    """Set MixVPR's image size, whose number of patches is the width of the row projection."""
+    """Set MixVPR's image size from its number of patches, the width of the row projection."""
     name = "aggregator.row_proj.weight"
     positions = Reader(state).size(name, 1)
-    otherwise = f"{name} found for {positions} positions, expected a square number"
+    otherwise = f"{name}: found {positions} positions, expected a square number"
     side = square_side(positions, otherwise) * config.backbone.patch_size
     return dataclasses.replace(config, image_size=(side, side))
 
 
 def _conv_ap_filter(state: State, config: ModelConfig) -> ModelConfig:
-    """Set the filter as the README says: bicubic only for the model of 4,096 dimensions."""
+    """Set the filter as Conv-AP's README says: bicubic only for the model of 4,096 dimensions."""
     assert isinstance(config.aggregator, ConvApConfig)
     name = "bicubic" if config.aggregator.channels == 1024 else "bilinear"
     return dataclasses.replace(config, preprocessing=PreprocessingConfig(filter=name))
 
 
 def _with_ghosts(state: State, config: ModelConfig) -> ModelConfig:
-    """Separate the clusters of the published files from their ghosts, which shapes do not show."""
+    """Separate SuperVLAD's clusters from its ghost clusters, whose number shapes do not show."""
     name = "aggregation.conv.weight"
     count = Reader(state).size(name, 0)
     if count not in (3, 5):
-        raise InputError(f"{name} found of {count} clusters, expected 5 (1 ghost) or 3 (2 ghosts)")
+        raise InputError(f"{name}: found {count} clusters, expected 5 (1 ghost) or 3 (2 ghosts)")
     ghosts = 1 if count == 5 else 2
     if ghosts == 2:
         warn(
@@ -81,7 +81,7 @@ class _Reference(Format):
         return parts | {"backbone": ["vit", "resnet", "vgg"]}
 
     def backbone_of(self, config: ModelConfig) -> BackboneNames:
-        """Return the names of any of these backbones."""
+        """Return the names of a DINOv2 or CNN backbone."""
         found = parts_of(config)
         names = {"vit": "dinov2", "resnet": "resnet-numbers", "vgg": "vgg-numbers"}
         sides = {"side": "dinov2-side", "side-multi-resolution": "dinov2-sides"}
@@ -100,7 +100,7 @@ class _Reference(Format):
         return self.head._replace(rows=tuple(Row((name,), (name,), SAME) for name in own))
 
     def infer(self, state: State) -> ModelConfig:
-        """Make the configuration of a state with SALAD or a class token."""
+        """Infer the configuration of a state whose head is SALAD or a class token."""
         head = self.head if super().has_head(state) else HEADS["class-token"]
         return Format.infer(dataclasses.replace(self, head=head, projection=None), state)
 
@@ -120,7 +120,7 @@ FORMATS: dict[str, Format] = {}
 
 
 def add_formats(facts: Mapping[str, Any], source: str) -> None:
-    """Add the chains, tables, backbones, heads and formats of one file, or none of them.
+    """Add all chains, tables, backbones, heads and formats of one file, or none of them.
 
     Raises:
         InputError: naming `source`, if a name is taken, or the content cannot be read.
@@ -166,7 +166,7 @@ def _add(facts: Mapping[str, Any], source: str) -> None:
 
 
 def _backbone(text: str) -> BackboneNames:
-    """Return the names for any of several backbones, after a prefix."""
+    """Parse "NAME,NAME PREFIX": the names for any of several backbones, after a prefix."""
     names, _, prefix = text.partition(" ")
     first, *others = (choose("backbone", name, _BACKBONES) for name in names.split(","))
     for other in others:
@@ -176,7 +176,7 @@ def _backbone(text: str) -> BackboneNames:
 
 
 def _classifier(layers: Mapping[str, tuple[int, int]]) -> Rows:
-    """Return the rows of torchvision's classifier; 0 means the width of features."""
+    """Return the rows of torchvision's classifier; a size of 0 means the backbone's width."""
 
     def blank(shape: tuple[int, ...], config: ModelConfig) -> np.ndarray:
         return np.zeros([size or config.backbone.dim for size in shape], np.float32)

@@ -19,11 +19,11 @@ class BackboneNames(NamedTuple):
     """How files name a backbone's parameters."""
 
     kinds: tuple[type[Backbone], ...]
-    """Classes of the backbones; empty for any, from another file."""
+    """Classes of the backbones; empty for any backbone, which is in another file."""
     rows: Rows
     """Table of their names after the prefix, and ours after `backbone.`."""
     marks: tuple[str, ...]
-    """Names of which any file with such a backbone has at least one."""
+    """Names of which every file with such a backbone has at least one."""
     prefix: str = ""
 
 
@@ -34,9 +34,9 @@ class Head(NamedTuple):
     rows: Rows
     """Table of their names after the prefix, and ours after `aggregator.`."""
     sizes: Mapping[str, str]
-    """Where to find the fields of the configuration in files."""
+    """Where files show each field of the configuration."""
     mark: str | None
-    """A name that any file with such a head has; None if it has no parameters."""
+    """A name that every file with such a head has; None if the head has no parameters."""
     prefix: str
 
     def infer(self, state: State) -> Aggregator:
@@ -55,17 +55,17 @@ class Format:
     backbone: BackboneNames
     head: Head
     image_size: tuple[int, int]
-    """Height and width in pixels of the images that it is evaluated at."""
+    """Height and width in pixels of the images that the family is evaluated on."""
     preprocessing: PreprocessingConfig
     encoder_rows: Rows
     projection: Row | None = None
     """Row of the projection, with {dim} for its width; None without one."""
     head_first: int = 0
-    """Number of the head's first rows that are before the backbone's."""
+    """Number of the head's rows that come before the backbone's."""
     encoder_first: bool = False
-    """Whether the cross-image encoder is before the head."""
+    """Whether the cross-image encoder comes before the head."""
     adapter: str = "none"
-    """Name of the adapter; "any" is any."""
+    """Name of the adapter; "any" allows all."""
     encoder: str = "none"
     """Name of the cross-image encoder; "any", or "none,NAME" if the file shows whether there is
     one."""
@@ -74,10 +74,10 @@ class Format:
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     """Fields that shapes do not show, by part."""
     adjust: Callable[[State, ModelConfig], ModelConfig] = lambda state, config: config
-    """Function that sets the other fields that a state shows."""
+    """Function that sets further fields from a state."""
     inside: str = ""
     """Key of the file's dictionary that holds the state, a slash, and a prefix of all names, as
-    torch's DataParallel adds it; empty: the file is the state."""
+    torch's DataParallel adds it; empty if the file is the state."""
     stored: Literal["torch", "safetensors"] = "torch"
     """Kind of file."""
     bare: bool = False
@@ -97,7 +97,7 @@ class Format:
         """Check that a model has exactly the family's parts.
 
         Raises:
-            InputError: one of its parts is another.
+            InputError: a part differs.
         """
         allowed = self.parts()
         for part, found in parts_of(config).items():
@@ -108,7 +108,7 @@ class Format:
             )
 
     def lines(self, config: ModelConfig, names: Iterable[str]) -> Iterator[Row]:
-        """Yield the table of a model with these parts and arrays, in the public order."""
+        """Yield the table's rows for a model with these arrays, in the public order."""
         names, backbone, head = list(names), self.backbone_of(config), self.head_of(config)
         before, after = head.rows[: self.head_first], head.rows[self.head_first :]
         yield from expand(before, names, "aggregator.", head.prefix)
@@ -134,7 +134,7 @@ class Format:
         return any(self.backbone.prefix + mark in state for mark in self.backbone.marks)
 
     def has_head(self, state: State) -> bool:
-        """Return whether a state has the family's head; any state has one without parameters."""
+        """Return whether a state has the family's head; every state has one without parameters."""
         return self.head.mark is None or self.head.prefix + self.head.mark in state
 
     def infer(self, state: State) -> ModelConfig:

@@ -72,7 +72,7 @@ def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
 
 
 def renamed_to(state: State, names: Set[str]) -> State:
-    """Return the reading of a state whose names are closest to these."""
+    """Return the reading of a state, as in `_readings`, whose names are closest to `names`."""
     return min((inside for _, inside in _readings(state)), key=lambda x: len(names ^ x.keys()))
 
 

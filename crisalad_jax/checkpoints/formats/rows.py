@@ -1,7 +1,7 @@
 """Rows of tables: which arrays of a torch file match ours, and how their axes are permuted.
 
-Forms only permute values. Gradients can therefore be converted like weights, and a round trip gives
-the same bits.
+Forms only permute values, so gradients can be converted like weights, and a round trip gives the
+same bits. Biases of keys are an exception: no output depends on them, and some forms drop them.
 """
 
 import itertools
@@ -19,7 +19,7 @@ from crisalad_jax.nn.backbones.vgg import VggConfig
 
 
 class Form(NamedTuple):
-    """Two functions, inverse to each other, between our arrays and theirs."""
+    """Two inverse functions between our arrays and theirs."""
 
     ours: Callable[..., Sequence[np.ndarray]]
     theirs: Callable[..., Sequence[np.ndarray]]
@@ -33,7 +33,7 @@ class Extra(NamedTuple):
     """An array of theirs that no model of ours uses, stored so that a round trip is exact."""
 
     initial: Callable[[Any], np.ndarray]
-    """Function of the model's configuration that makes it, if no such file was read."""
+    """Function of the model's configuration that makes the array, if no file had it."""
     form: Form = SAME
     optional: bool = False
     """Whether files may lack it, so that it is written only if it was read."""
@@ -46,7 +46,7 @@ class Absent(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Corresponding arrays, or layers whose arrays a table lists. "#" is counted from 0."""
+    """Corresponding arrays, or layers whose arrays a table lists. "#" is a number, from 0."""
 
     ours: tuple[str, ...]
     theirs: tuple[str, ...]
@@ -122,11 +122,11 @@ _LAYERS = {
     # Before whitening, hloc's descriptor has the first channel of all clusters, then the second.
     "hloc-whitening": Form(lambda w: (_by_cluster(w.T),), lambda w: (_by_channel(w).T,)),
 }
-"""Forms of the weights of layers, which may have a bias, by the layer's name."""
+"""Forms of the weights of layers, which may have a bias, by kind of layer."""
 
 
 def _zeros(shape: Callable[[Any], tuple[int, ...]], form: Form = SAME) -> Extra:
-    """Return an array of zeros for when no file was read; the configuration gives its shape."""
+    """Return an extra that is zeros if no file had it; the configuration gives its shape."""
     return Extra(lambda config: np.zeros(shape(config), np.float32), form)
 
 
@@ -162,8 +162,8 @@ EXTRAS = {
     "extra-branch-1": _zeros(lambda config: (config.aggregator.hidden,)),
     "extra-branch-2": _zeros(lambda config: (192, config.aggregator.hidden, 1, 1)),
     "extra-branch-3": _zeros(lambda config: (192,)),
-    # What Pair-VPR's first training stage predicts masked pixels with, and positions with a row for
-    # the class token, which its code makes from the others.
+    # From Pair-VPR's first training stage: the prediction of masked pixels, and a copy of the
+    # positions with a row for the class token.
     "extra-decoder-mask": _zeros(lambda config: (1, 1, config.aggregator.width)),
     "extra-decoder-positions": _zeros(
         lambda config: (1 + config.aggregator.positions, config.aggregator.width)
@@ -181,7 +181,7 @@ ABSENT = {
 
 
 def read_tables(texts: Mapping[str, str], known: Mapping[str, Rows]) -> dict[str, Rows]:
-    """Read tables, of which later ones may include rows of earlier ones."""
+    """Read tables; later ones may include rows of earlier ones."""
     bias = Row(("bias",), ("bias",), SAME)
     tables: dict[str, Rows] = {
         name: (Row(("weight",), ("weight",), form), bias) for name, form in _LAYERS.items()
@@ -218,7 +218,7 @@ def read_table(text: str, tables: Mapping[str, Rows]) -> Rows:
 def expand(rows: Rows, names: Iterable[str], ours: str = "", theirs: str = "") -> Iterator[Row]:
     """Yield the rows of a model's arrays, and of the extra arrays of its layers.
 
-    Rows of arrays that the model lacks are left out; those with "#" are repeated for all it has.
+    Rows of arrays that the model lacks are left out; rows with "#" are repeated for each number.
 
     Args:
         rows: the table.

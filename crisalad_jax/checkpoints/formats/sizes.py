@@ -27,7 +27,7 @@ from crisalad_jax.utils.errors import InputError
 _V = TypeVar("_V", bound=VisionTransformer)
 State = Mapping[str, np.ndarray]
 _HEAD_WIDTH = 64
-"""Width of an attention head in every DINOv2, and in TransVPR; shapes do not show their number."""
+"""Width of an attention head in every DINOv2 and TransVPR; shapes do not show the head count."""
 _SIDE_ALPHA = 0.5
 """Weight of EDTformer's adapters, which shapes do not show."""
 _PERIODS = "rope_embed.periods"
@@ -59,7 +59,7 @@ class Reader(NamedTuple):
         return shape[axis]
 
     def has(self, name: str) -> bool:
-        """Return whether there is an array of this name."""
+        """Return whether an array of this name exists."""
         return self.prefix + name in self.state
 
     def count(self, name: str) -> int:

@@ -33,7 +33,7 @@ def table(config: ModelConfig, name: str) -> list[Row]:
     rows = list(form.lines(config, names))
     left_out = names.keys() - {ours for row in rows for ours in row.ours}
     if left_out and not form.bare:
-        raise InputError(f"format {name}: found {few(sorted(left_out))}, expected a model without")
+        raise InputError(f"format {name}: found {few(sorted(left_out))}, expected none of these")
     return rows
 
 
@@ -63,14 +63,14 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
     wrong = differences(_shown(with_non_semantic_fields_of(config, read_back)), _shown(config))
     if wrong:
         raise InputError(
-            f"format {name}: these cannot be distinguished from the published ones: "
+            f"format {name}: cannot store settings other than the published ones: "
             f"{'; '.join(wrong)} (format {REFERENCE} can)"
         )
     return read_back
 
 
 def _shown(config: ModelConfig) -> ModelConfig:
-    """Return a configuration with all fields reset that a trained model's arrays do not show."""
+    """Reset the fields of a configuration that a trained model's arrays do not show."""
     backbone = config.backbone
     if not isinstance(backbone, VisionTransformer):
         return config
@@ -151,7 +151,7 @@ def to_state(
 def _theirs(
     leaves: State, lines: list[Row], config: ModelConfig, extras: State | None
 ) -> dict[str, np.ndarray]:
-    """Return their arrays; if `extras` is None, all that a file may have, with initial values."""
+    """Return public arrays; if `extras` is None, all that a file may have, with initial values."""
     ours, state = _numbered(leaves), {}
     for row in lines:
         if isinstance(row.form, Form):
@@ -182,7 +182,7 @@ def _numbered(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _from_numbered(ours: State, config: ModelConfig) -> Crisalad:
-    """Invert `_numbered`; empty arrays, such as absent registers, have no line in any table."""
+    """Invert `_numbered`; empty arrays, such as absent registers, have no row in any table."""
     template = parameter_shapes(config)
     leaves = []
     for name, leaf in named_leaves(template).items():

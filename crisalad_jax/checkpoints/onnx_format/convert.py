@@ -19,7 +19,7 @@ def convert(graph: Graph, traced: Any, inputs: Sequence[Value]) -> list[Value]:
 
     Args:
         graph: the graph to append to.
-        traced: the program, of `jax.make_jaxpr`.
+        traced: the program, from `jax.make_jaxpr`.
         inputs: its arguments, constants or not.
 
     Returns:
@@ -65,17 +65,17 @@ def _equation(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
             return [_nothing(var.aval) for var in eqn.outvars]
         return CONVERTERS.get(name, _folded)(graph, inputs, eqn)
     except Unsupported as error:
-        nothing = np.dtype(np.float32)  # JAX's own types, such as a key's, have no other
+        nothing = np.dtype(np.float32)  # a placeholder, as a key's type is not NumPy's
         return [Value(var.aval.shape, nothing, missing=str(error)) for var in eqn.outvars]
 
 
 def _nothing(aval: Any) -> Value:
-    """Return an empty array, whose symbolic side engines cannot infer."""
+    """Return an empty array without symbolic sides, which engines could not infer."""
     return Value.of(np.zeros([s if is_known(s) else 1 for s in aval.shape], aval.dtype))
 
 
 def _folded(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    """Compute any primitive that has constant inputs."""
+    """Compute any primitive whose inputs are all constants."""
     arrays = [value.constant for value in inputs]
     wholes = [var.aval.shape for var in eqn.invars]
     known = all(is_known(size) for shape in wholes for size in shape)

@@ -64,7 +64,7 @@ class Value:
 
 
 class Graph:
-    """The nodes so far."""
+    """A graph under construction."""
 
     def __init__(self) -> None:
         """Start without nodes."""
@@ -75,7 +75,7 @@ class Graph:
         self._names: dict[Any, str] = {}
 
     def constant(self, array: np.ndarray) -> str:
-        """Return the name of a constant; small ones that are equal share it."""
+        """Return the name of a constant; equal small ones share a name."""
         small = array.nbytes <= 1024
         key = (str(array.dtype), array.shape, array.tobytes()) if small else id(array)
         if key not in self._names:
@@ -88,11 +88,11 @@ class Graph:
         return value.name if value.constant is None else self.constant(value.constant)
 
     def ints(self, *numbers: int) -> str:
-        """Return the name of a constant vector of int64, as nodes take sides and axes."""
+        """Return the name of a constant int64 vector, in which nodes take sides and axes."""
         return self.constant(np.array(numbers, np.int64))
 
     def node(self, operator: str, inputs: Sequence[str], **attributes: Any) -> str:
-        """Append a node of one output, and return its name."""
+        """Append a node with one output, and return the name of its output."""
         name = f"{operator}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(operator, inputs, [name], name=name, **attributes))
         return name
@@ -100,7 +100,7 @@ class Graph:
     def add(
         self, operator: str, inputs: Sequence[Value | str], shape: Shape, dtype: Any, **fields: Any
     ) -> Value:
-        """Append a node of one output, and return it."""
+        """Append a node with one output, and return the output."""
         names = [each if isinstance(each, str) else self.name(each) for each in inputs]
         return Value(tuple(shape), np.dtype(dtype), self.node(operator, names, **fields))
 

@@ -209,7 +209,7 @@ def _pad(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     x, filling = inputs
     config = eqn.params["padding_config"]
     if any(inside or low < 0 or high < 0 for low, high, inside in config):
-        raise Unsupported("pad between numbers, or by less than none")
+        raise Unsupported("pad between values, or by a negative width")
     axes = [axis for axis, sides in enumerate(config) if any(sides)]
     x = graph.full(x, eqn.invars[0].aval.shape, axes)
     shape = [low + size + high for size, (low, high, _) in zip(x.shape, config, strict=True)]
@@ -271,7 +271,7 @@ def _reduce(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
         x = graph.full(x, eqn.invars[0].aval.shape, axes)
     name = _REDUCTIONS[eqn.primitive.name]
     shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
-    # Only the sum takes its axes as an input, since version 13.
+    # Only the sum takes its axes as an input, since opset 13.
     is_sum = name == "ReduceSum"
     given, fields = ([x, graph.ints(*axes)], {}) if is_sum else ([x], {"axes": list(axes)})
     reduced = graph.add(name, given, shape, x.dtype, keepdims=0, **fields)

@@ -24,7 +24,7 @@ class _Images(quantization.CalibrationDataReader):
 def quantise(
     program: pathlib.Path, images: np.ndarray, nodes: Sequence[str], *, per_channel: bool
 ) -> None:
-    """Quantise a program of images in place.
+    """Quantise a program that takes images, in place.
 
     Args:
         program: the file in float32, for any number of images; its weights are next to it, with
@@ -33,7 +33,7 @@ def quantise(
         nodes: names of the products to quantise.
         per_channel: whether each column of weights has its own scale, which is more accurate.
     """
-    # It finds its weights by file name, so the names stay the same.
+    # The program finds its weights by file name, so the names stay the same.
     whole = program.parent / "float32"
     whole.mkdir()
     for each in (program, program.with_name(f"{program.name}.data")):

@@ -25,20 +25,20 @@ class CameraAugmentConfig(LightAugmentConfig):
     """Probability of random filters over all colours, which change textures but not outlines (Xu
     et al., ICLR 2021)."""
     occlusion: Share = 0.3
-    """Probability that a part is covered."""
+    """Probability that part of the image is covered."""
     motion: Share = 0.2
     """Probability of motion blur, of up to a sixteenth of the width."""
     coarse: Share = 0.3
-    """Probability of fewer pixels: down to two fifths of the sides."""
+    """Probability of a lower resolution, down to two fifths of each side."""
     noise: NonNegativeFloat = 8.0
-    """Largest deviation of noise, in grey levels."""
+    """Largest standard deviation of noise, in grey levels."""
     jpeg: Share = 0.4
     """Probability of JPEG coding."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Mirror all images of a place together, change this one's light, add camera effects."""
+        """Mirror an image if its place is mirrored, change its light, and add camera effects."""
         if self.flip > 0 and of_place.random() < self.flip:
             image = cv2.flip(image, 1)
         if self.perspective > 0:
@@ -87,7 +87,7 @@ def _textured(image: Image, deviation: float, generator: np.random.Generator) ->
 
 
 def _filtered(image: Image, generator: np.random.Generator) -> Image:
-    """Blend the image with a randomly filtered copy of the same mean and deviation."""
+    """Blend the image with a randomly filtered copy of the same mean and standard deviation."""
     side = int(generator.choice((1, 3, 5)))
     weights = generator.standard_normal((3, 3, side, side), np.float32)
     pixels = image.astype(np.float32)

@@ -1,7 +1,7 @@
 """CosPlace's and EigenPlaces' augmentation: colour jitter, then a crop (Berton et al. 2022).
 
-Torchvision's `ColorJitter` and `RandomResizedCrop` on tensors from 0 to 1, rounded to bytes at the
-end.
+It follows torchvision's `ColorJitter` and `RandomResizedCrop` on tensors from 0 to 1, and rounds to
+bytes at the end.
 """
 
 import math

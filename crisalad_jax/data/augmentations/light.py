@@ -38,7 +38,7 @@ class LightAugmentConfig(Augmentation):
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Mirror all images of a place together, then change this one."""
+        """Mirror an image if its place is mirrored, then change its light."""
         if self.flip > 0 and of_place.random() < self.flip:
             image = cv2.flip(image, 1)
         return self.change_light(image, generator)

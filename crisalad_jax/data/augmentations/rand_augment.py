@@ -1,4 +1,4 @@
-"""RandAugment (Cubuk et al., CVPR Workshops 2020): torchvision's strengths, Pillow's pixels."""
+"""RandAugment (Cubuk et al., CVPR Workshops 2020), as in torchvision on Pillow images."""
 
 import functools
 import math
@@ -22,7 +22,7 @@ _LEVELS = np.arange(256)
 
 @AUGMENTATIONS.register("rand-augment")
 class RandAugmentConfig(Augmentation):
-    """RandAugment (Cubuk et al. 2020): torchvision's 14 operations, GSV-Cities' strength."""
+    """RandAugment (Cubuk et al. 2020): torchvision's 14 operations, with GSV-Cities' strength."""
 
     operations: NonNegativeInt = 3
     magnitude: Annotated[int, limited(0, MAGNITUDE_BINS - 1)] = 9

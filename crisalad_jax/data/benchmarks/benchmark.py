@@ -23,7 +23,7 @@ class Benchmark:
     """One evaluation set, in the order in which its images are described."""
 
     name: str
-    """Name for exactly the images read, such as "sped_val/test (@UTM, 25 m)"."""
+    """Name that identifies the images read, such as "sped_val/test (@UTM, 25 m)"."""
     root: pathlib.Path
     database: tuple[pathlib.Path, ...]
     queries: tuple[pathlib.Path, ...]
@@ -31,7 +31,7 @@ class Benchmark:
     """Database indices for each query, ascending; empty if it has no match, which counts as a miss.
     None if the set has no ground truth at all."""
     rule: str
-    """Rule that makes a database image positive, in words."""
+    """Description of the rule that makes a database image a positive."""
     database_positions: Float64[np.ndarray, "database axis"] | None = None
     """East and north in metres; if a set is wider than one UTM zone, points on the ellipsoid
     (`metres.on_ellipsoid`). None if there are none or only placeholders."""
@@ -56,7 +56,7 @@ class Benchmark:
     ) -> "Benchmark":
         """Return the set without the images that are marked as unreadable.
 
-        A query keeps its remaining positives. One without any is a miss, as in other sets.
+        Queries retain their readable positives. One without any counts as a miss, as in other sets.
 
         Args:
             queries: whether each query could be read.

@@ -41,7 +41,7 @@ def read_folders(
     else they become points on the ellipsoid (`metres.comparable`).
 
     Args:
-        root: the folder that holds the two, or one with `images/{test,val,train}` that do.
+        root: the folder that holds the two, or one whose `images/{test,val,train}` do.
         split: None takes `test`, else `val`.
         radius: if positions are the ground truth, metres within which an image is a positive,
             inclusive; None is 25.
@@ -87,14 +87,13 @@ def _by_frames(
     if frames < 0 or len(database) != len(queries):
         raise InputError(
             f"{root}: found {frames} frames, {len(database)} database images and {len(queries)} "
-            "queries, expected at least 0 frames, and as many images in both folders: a frame "
-            "matches those of the same moment"
+            "queries, expected at least 0 frames, and the same number of images in both folders"
         )
     count, apart = len(queries), counted(frames, "frame")
     name, rule = f"{name} (two folders, +-{apart})", f"at most {frames} frames apart"
     if (count, frames) == (3450, 2):
         name = "Nordland-test (SelaVPR: 3450 + 3450 images, +-2 frames)"
-        rule += "; by its number of images it is SelaVPR's Nordland-test"
+        rule += "; identified by its number of images as SelaVPR's Nordland-test"
     database, queries = (tuple(sorted(side, key=_in_numbers)) for side in (database, queries))
     windows = (range(max(0, i - frames), min(count, i + frames + 1)) for i in range(count))
     positives = tuple(np.array(window, np.int64) for window in windows)
@@ -102,7 +101,7 @@ def _by_frames(
 
 
 def _in_numbers(path: pathlib.Path) -> list[str | int]:
-    """Return a sort key that orders the numbers in a path by value. Its odd parts are numbers."""
+    """Return a sort key that orders the numbers in a path by value; its odd items are numbers."""
     parts = re.split(r"(\d+)", path.as_posix())
     return [int(part) if i % 2 else part for i, part in enumerate(parts)]
 
@@ -134,8 +133,9 @@ def _by_table(
     wrong = [name for name, of in matches.items() if not of or (_NO_MATCH in of and len(of) > 1)]
     if wrong:
         raise InputError(
-            f"{path}: found {len(wrong)} of {len(matches)} queries without a line, or with a match "
-            f"and without, expected either; the first is {wrong[0]} ('{wrong[0]},' has no match)"
+            f"{path}: found {len(wrong)} of {len(matches)} queries without a line, or with matches "
+            f"and a line for none, expected either; the first is {wrong[0]} (the line "
+            f"'{wrong[0]},' means no match)"
         )
     return tuple(np.array(sorted(of - {_NO_MATCH}), np.int64) for of in matches.values())
 

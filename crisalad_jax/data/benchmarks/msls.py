@@ -62,7 +62,7 @@ def read_msls(
 
     Args:
         root: the folder with `train_val/`, or `train_val/` itself.
-        split: `val` (the default) or `train`; its cities that are in the folder are read.
+        split: `val` (the default) or `train`; those of its cities that are in the folder are read.
         radius: radius of positives in metres, inclusive. Images of different cities never match.
         max_heading_difference: largest difference of two compass angles in degrees, inclusive, for
             a match (the CriSALAD paper says 40); None allows any, as the official code does.
@@ -106,7 +106,7 @@ def read_msls(
         name += f" and {limit:g} degrees"
         rule += f" and compass angles at most {limit:g} degrees apart"
     if subtask:
-        rule += "; queries of the subtask all with a database image in that distance"
+        rule += "; queries of the subtask all with a database image within that distance"
     images, asking = (
         tuple(path for side in sides for path in side.images) for sides in (database, queries)
     )
@@ -139,7 +139,7 @@ class _Side(NamedTuple):
     headings: Float64[np.ndarray, " images"]
     """Compass angles in degrees; 0 if not requested."""
     clusters: np.ndarray
-    """Names of each image's place, within the city; empty texts if not requested."""
+    """Name of each image's place, within the city; empty strings if not requested."""
 
 
 def _positions(sides: list[_Side]) -> Float64[np.ndarray, "images axis"]:

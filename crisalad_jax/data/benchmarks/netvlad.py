@@ -1,7 +1,7 @@
 """NetVLAD's `.mat` files (Arandjelovic et al., CVPR 2016): Pitts30k, Pitts250k, Tokyo.
 
-A struct `dbStruct` with the fields whichSet, dbImage, utmDb (2 x N), qImage, utmQ, numDb, numQ,
-posDistThr, and others that are not needed here.
+Each holds a struct `dbStruct` with whichSet, dbImage, utmDb (2 x N), qImage, utmQ, numDb, numQ,
+posDistThr, and other fields that are not needed here.
 """
 
 import os

@@ -36,7 +36,7 @@ _FILE = re.compile(r"(?P<prefix>(?:.*_)?)(?P<kind>dbImages|qImages|gt|qIdx|pIdx)
 _MSLS_IMAGE = re.compile(r"train_val/([^/]+)/(?:database|query)/images/[^/]+")
 # Look in the queries' folders first: a query may have the same name as a database image.
 _FOLDERS = {"dbImages": (".",), "qImages": ("queries_real", ".")}
-_NORDLAND_RULE = ", which are 10i - 1, 10i and 10i + 1 for query i: by that it is Nordland*"
+_NORDLAND_RULE = ", which are 10i - 1, 10i and 10i + 1 for query i; this identifies Nordland*"
 
 _MOST = 2**62
 _Lists = dict[str, pathlib.Path]
@@ -170,7 +170,7 @@ def _names(path: pathlib.Path) -> list[str]:
     names = array.reshape(-1).tolist()
     if array.ndim != 1 or not names or not all(isinstance(name, str) for name in names):
         raise InputError(
-            f"{path}: found an array of {array.shape} of {array.dtype}, expected names of images"
+            f"{path}: found {array.dtype} of shape {array.shape}, expected names of images"
         )
     return names
 
@@ -299,9 +299,9 @@ def _read_array(file: io.BytesIO) -> np.ndarray:
 
 
 class _Unpickler(pickle._Unpickler):
-    """Looks up only `_SAFE_NAMES`.
+    """An unpickler that looks up only `_SAFE_NAMES`.
 
-    It is the pure-Python one: the one in C allocates as much memory as a damaged file says.
+    It is in pure Python: the one in C allocates as much memory as a damaged file claims.
     """
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:

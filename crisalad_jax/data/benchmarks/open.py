@@ -32,7 +32,7 @@ LAYOUTS: dict[str, Callable[..., Benchmark]] = {
     "msls-subtask": functools.partial(read_msls, subtask=True),
     "folders": read_folders,
 }
-"""Reader of each layout. It takes a path, then any of `open_benchmark`'s options by name."""
+"""Reader of each layout. It takes a path, then some of `open_benchmark`'s options by name."""
 
 
 @takes(root=PATH)

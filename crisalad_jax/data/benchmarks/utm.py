@@ -84,8 +84,8 @@ def read_utm(
         apart = counted(int(frames), "frame")
         name = f"{_NORDLANDS[metres]}{which}, +-{apart}"
         rule = (
-            f"at most {apart} apart ({radius:g} m); it is Nordland by eastings of 0 and "
-            f"northings of {metres:.4g} m a frame"
+            f"at most {apart} apart ({radius:g} m); identified as Nordland by eastings of 0 "
+            f"and northings of {metres:.4g} m a frame"
         )
         return Benchmark(name, root, database, asking, positives, rule)
 
@@ -93,11 +93,11 @@ def read_utm(
         known = _PAIRED.get(len(database)) if len(database) == len(asking) else None
         name = f"{known or name}{which} (@UTM placeholders 1 km apart: a place matches itself only)"
         rule = (
-            "the same place; by eastings of 0 and northings of whole kilometres the coordinates "
-            "are placeholders"
+            "the same place; the coordinates, eastings of 0 and northings of whole kilometres, are "
+            "placeholders"
         )
         if known:
-            rule += f", and by {len(database)} places it is {known}"
+            rule += f"; identified by its {len(database)} places as {known}"
         return Benchmark(name, root, database, asking, within(places, asked, radius), rule)
 
     rule = f"UTM distance of at most {radius:g} m"
@@ -114,7 +114,7 @@ def read_utm(
         name = f"{name}{which} (@UTM, {ending})"
     else:
         name = f"{msls_title(cities)}{which}, downloader style, {len(asking)} queries, {ending}"
-        rule += f"; by the notes in the names it is MSLS of {', '.join(sorted(cities))}"
+        rule += f"; identified by the notes in the names as MSLS of {', '.join(sorted(cities))}"
     return Benchmark(name, root, database, asking, positives, rule, places, asked, radius)
 
 

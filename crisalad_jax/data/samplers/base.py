@@ -1,4 +1,4 @@
-"""Samplers choose the places, and their images, for the batches of an epoch."""
+"""Samplers, which choose the places, and their images, for the batches of an epoch."""
 
 import abc
 import itertools
@@ -17,10 +17,10 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Int
 
 _TURNS = 20
-"""Number of turns without a batch before giving up."""
+"""Number of calls of a sampler without a batch before giving up."""
 
 Describe = Callable[[Sequence[pathlib.Path]], Float[np.ndarray, "n descriptor"]]
-"""Takes image files; returns their descriptors, NaN for images that cannot be read."""
+"""Function from image files to their descriptors, NaN for images that cannot be read."""
 
 
 @brief
@@ -56,7 +56,7 @@ class Sampler(Part, abc.ABC):
     """
 
     describes: ClassVar[bool] = False
-    """Whether it uses descriptors, which the current model makes when an epoch begins."""
+    """Whether it uses descriptors, which the current model computes when an epoch begins."""
     regroups: ClassVar[bool] = False
     """Whether it makes its own places: a group may mix images of several of the set's places, some
     of which may have few images."""
@@ -115,7 +115,7 @@ def epoch_batches(
         images_per_place: number of images of each place.
         seed: seed of the draws, together with the epoch.
         epoch: index of the epoch, from 0.
-        steps: number of batches; None takes what the sampler draws in a turn.
+        steps: number of batches; None takes what the sampler draws in one call.
         describe: describes images; for samplers with `Sampler.describes`.
 
     Returns:
@@ -123,7 +123,7 @@ def epoch_batches(
 
     Raises:
         InputError: a place has too few images, the sampler finds no batch, or returns anything but
-            what `Sampler.apply` says; no such sampler, a negative seed or epoch, less than one
+            what `Sampler.apply` specifies; no such sampler, a negative seed or epoch, less than one
             step, or a missing `describe`.
     """
     drawn_by = SAMPLERS.resolve(sampler, "sampler")
@@ -158,7 +158,7 @@ def epoch_batches(
         descriptors = describe([places.path(image) for image in described])
     drawn: list[np.ndarray] = []
     for turn in itertools.count():
-        # The first turn draws the same as an epoch without `steps`.
+        # The first call draws the same as in an epoch without `steps`.
         size = places_per_batch, images_per_place
         draw = Draw(*size, epoch, generator(turn, key=0), described, descriptors)
         drawn.append(_draw(places, drawn_by, draw))
@@ -184,14 +184,14 @@ def labels_of(
 
 
 def _draw(places: Places, sampler: Sampler, draw: Draw) -> Int[np.ndarray, "steps places images"]:
-    """Draw the batches of one turn, and check them."""
+    """Draw the batches of one call, and check them."""
     found = np.asarray(sampler.apply(places, draw))
     is_order, count = found.ndim == 1, len(places.names if found.ndim == 1 else places.files)
     size = draw.places_per_batch, draw.images_per_place
     where, what = f"sampler {sampler.part_name}", "places" if is_order else "images"
     require(
         np.issubdtype(found.dtype, np.integer) and (is_order or found.shape[1:] == size),
-        f"{where}: found {found.dtype} of shape {found.shape}, expected numbers of places in an "
+        f"{where}: found {found.dtype} of shape {found.shape}, expected indices of places in an "
         f"order, or of images in the shape (steps, {size[0]}, {size[1]})",
     )
     outside = found[(found < 0) | (found >= count)]

@@ -110,12 +110,12 @@ class GeoVisual(Cliques):
     Written from the abstract of SAGE (Chen et al., ICLR 2026), whose training code is not
     published: its graph is rebuilt before each epoch from the positions of images and how similar
     they look to the current model; clusters begin at anchors of high affinity, and expand by a
-    greedy weighted clique. The numbers here are ours.
+    greedy weighted clique. The default values are ours.
     """
 
     anchors: PositiveInt = 16
-    """Number of random places, of which the one of highest affinity begins: the mean similarity to
-    the `similar` most similar places of its city."""
+    """Number of random places; that of highest affinity begins. Affinity is the summed similarity
+    to the `similar` most similar places of its city."""
 
     def _first(self, among: Int[np.ndarray, " place"], places: Places, draw: Draw) -> int:
         drawn = draw.generator.choice(among, min(self.anchors, len(among)), replace=False)
@@ -149,7 +149,7 @@ def _alike(
 def _cliques(
     points: Float[np.ndarray, "image 2"], radius: float, size: int
 ) -> list[Int[np.ndarray, " clique"]]:
-    """Find groups of at least `size` points within a radius of each other, a radius apart.
+    """Find groups of at least `size` points within a radius of each other, but of no other group.
 
     A group starts at the first remaining point and adds the nearest point within the radius of all
     its members until it is maximal; then its neighbours are left out.

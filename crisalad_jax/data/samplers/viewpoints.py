@@ -74,5 +74,5 @@ class Viewpoints(Sampler):
 
 @functools.lru_cache(maxsize=4)
 def _found(places: Places, config: ClassesConfig, min_images: int) -> Sequence[Sequence[Class]]:
-    """Find the classes of both sides (cached: an epoch may take several turns of them)."""
+    """Find the classes of both sides (cached: an epoch may draw from them several times)."""
     return find_classes(places, config, min_images)

@@ -25,7 +25,7 @@ class CheckedPart:
     """A part of a folder: a split, or a folder of queries."""
 
     name: str
-    """Its name by `open_benchmark`; if it cannot be opened, its location."""
+    """Its name according to `open_benchmark`; if it cannot be opened, its location."""
     database: int | None = None
     """Number of database or training images."""
     queries: int | None = None
@@ -66,7 +66,7 @@ def check_set(
     Args:
         folder: the folder, or one file of lists in it.
         expected: name of the set in `SETS` that it should be; None allows any, and a custom set
-            then has nothing to compare with.
+            is then not compared.
         read: whether to decode every image too.
         quiet: whether to hide the progress bar.
 
@@ -105,7 +105,7 @@ def check_set(
 
 
 def _openings(root: pathlib.Path, published: PublishedSet | None) -> Sequence[dict[str, Any]]:
-    """List the options that open each part of a folder; `root` among them is a file in it."""
+    """List the options that open each part of a folder; an option `root` is a file in it."""
     if root.is_file():
         return [{}]
     if is_msls(root):

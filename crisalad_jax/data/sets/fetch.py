@@ -56,7 +56,7 @@ def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> 
     require(
         published.is_fetched,
         f"{name}: found a set that only a person can get ({published.ask}), expected one to "
-        f"download; `crisalad data list {name}` has the steps by hand",
+        f"download; `crisalad data list {name}` lists the steps by hand",
     )
     check_new_folder(to)
     require(not is_offline(), f"{name}: {OFFLINE} forbids the network")
@@ -134,12 +134,12 @@ def _rsync(address: str, folder: pathlib.Path, *, quiet: bool) -> None:
     command = ["rsync", "-rtz", "--partial", *shown, f"{address}/", str(folder)]
     done = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
     if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["no words"])[-1]
+        said = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise InputError(f"{address}: found rsync's code {done.returncode} ({said}), expected 0")
 
 
 def _open(file: SetFile, archive: pathlib.Path, target: pathlib.Path, *, quiet: bool) -> None:
-    """Unpack an archive and the one in it, or copy a file to its place."""
+    """Unpack an archive and any archive in it, or copy a file to its place."""
     if not is_archive(archive.name):
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(archive, target)

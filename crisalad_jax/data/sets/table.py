@@ -45,12 +45,12 @@ class SetPart:
     """Number of images; None if unknown."""
     queries: int | None = None
     printed: str = ""
-    """A regular expression for the beginning of its name by `open_benchmark`, if other sets have
-    the same counts, or none are known."""
+    """A regular expression for the beginning of the name that `open_benchmark` gives it, if other
+    sets have the same counts, or none are known."""
 
     @property
     def words(self) -> str:
-        """The counts in words."""
+        """Its name and counts, for a message."""
         counts = (("database images", self.database), ("queries", self.queries))
         known = [f"{count:,} {what}" for what, count in counts if count is not None]
         return f"{self.name}: {' and '.join(known) or 'no count is published'}"

@@ -45,11 +45,11 @@ def race(
     *,
     quiet: bool = True,
 ) -> dict[str, list[float]]:
-    """Time calls in turns; each call does all of its work and waits for it.
+    """Time calls in turns; each call finishes all of its work before it returns.
 
     The first call of each contender, which compiles, does not count, nor does the first of each
-    turn. A call of `_LONG` or longer is then made once, any other `_CALLS` times. A contender makes
-    its call for a turn and then drops it, so that one model is in memory at a time. A progress bar
+    turn. A call of `_LONG` or longer is then made once, any other `_CALLS` times. A contender
+    builds its call for each turn, so that only one model is in memory at a time. A progress bar
     counts the turns, unless `quiet`.
 
     Returns:
@@ -95,8 +95,8 @@ class AdapterCost(NamedTuple):
 
     adapter: str
     paper_parameters: int | None
-    """Number of parameters as the paper counts them: docs/comparison.md; None for adapters that it
-    lacks."""
+    """Number of parameters as the paper counts them (docs/comparison.md); None for adapters that
+    it lacks."""
     parameters: int
     """Number of parameters of one adapter here, with batch norms' running statistics."""
     paper_macs: int | None
@@ -106,7 +106,7 @@ class AdapterCost(NamedTuple):
     """Time of a block in a training step, relative to one without adapter, over the rounds; None if
     not measured."""
     memory: float | None
-    """Memory of the same, relative to a block without adapter, as the compiler counts it."""
+    """Memory of that block, relative to one without adapter, as the compiler counts it."""
 
 
 _PAPER_PARAMETERS: Mapping[str, int] = {

@@ -58,8 +58,8 @@ METHODS: Mapping[str, ComparedMethod] = {
     "crisalad": ComparedMethod("CriSALAD", "crisalad"),
     "boq": ComparedMethod("BoQ", "boq"),
 }
-"""Methods in the order of Table 1. A + is the head of a method on CriSALAD's backbone, with
-CriSALAD's training. Other names are recipes or parts, without a second stage."""
+"""Methods in the order of Table 1. crisalad+NAME is the head of a method on CriSALAD's backbone,
+with CriSALAD's training. Other names are recipes or parts, without a second stage."""
 
 
 def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod:

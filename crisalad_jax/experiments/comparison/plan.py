@@ -63,7 +63,7 @@ class ComparisonConfig:
 
     kind: Literal["compare", "ablate"]
     names: tuple[str, ...]
-    """Names of `METHODS`, `ABLATIONS`, recipes and parts, and any others that `weights` has."""
+    """Names of `METHODS`, `ABLATIONS`, recipes and parts, and any others that `weights` defines."""
     test: tuple[str, ...]
     """Evaluation sets, in any layout that `open_benchmark` reads."""
     train: str | None = None
@@ -86,7 +86,7 @@ class ComparisonConfig:
     """What to do with unreadable images. "skip": training masks them out, and evaluation sets leave
     them out; each call reads all images of these sets to find them."""
     grouping: str = "single"
-    """Comma-separated groupings; a method without a cross-image encoder needs one."""
+    """Comma-separated groupings; methods without a cross-image encoder do not depend on them."""
     rerank: int = 20
     """Number of first retrievals that methods with a second stage re-rank."""
     seeds: PositiveInt = 3
@@ -187,7 +187,7 @@ class Variant:
 
     name: str
     labels: tuple[str, ...]
-    """Cells before its numbers."""
+    """Cells of its row before the results."""
     run: str
     """Name of the run that makes its model, which other variants may share."""
     training: TrainConfig
@@ -263,7 +263,7 @@ def prepare(config: ComparisonConfig, *, quiet: bool = True) -> Prepared:
 
 
 def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
-    """Map names to the files of weights of their models."""
+    """Map names to the weight files of their models."""
     files: dict[str, pathlib.Path] = {}
     for text in config.weights:
         name, separator, file = text.partition("=")

@@ -97,7 +97,7 @@ class Run(NamedTuple):
         if changed:
             raise InputError(
                 f"{self.folder}: holds a run with other settings: {few(changed)}; give the same to "
-                "go on with it (methods, rows, seeds and sets may be added), or another folder"
+                "resume it (methods, rows, seeds and sets may be added), or another folder"
             )
         return result
 
@@ -213,7 +213,7 @@ def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any])
     results: dict[str, list[tuple[Run, RunResult]]] = {}
     for run in runs:
         path = run.folder / "result.json"
-        require(run.is_done, f"{path}: found none of this run's, expected it until the end")
+        require(run.is_done, f"{path}: found no complete result, expected the one written before")
         results.setdefault(run.variant.run, []).append((run, run.read()))
     rows = [_rows(variant, reference, sets, results, speed) for variant in prepared.variants]
     adapters = []
@@ -315,7 +315,7 @@ def _training_seconds(results: Sequence[tuple[Run, RunResult]]) -> list[float]:
 
 
 def _notes(prepared: Prepared, reference: Variant, speed: Mapping[str, Any]) -> list[str]:
-    """Explain how the numbers were obtained; docs/comparison.md says more."""
+    """Explain how the results were obtained; docs/comparison.md says more."""
     variants, sizes = prepared.variants, {}
     for variant in variants:
         training = variant.training

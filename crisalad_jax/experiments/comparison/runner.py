@@ -129,7 +129,7 @@ def compare(
         do(_complete, (prepared, runs, quiet, beside), left())
         speed = _measured(prepared, runs, out / "speed.json")
         if speed is None:
-            say("images described a second, all models in turns")
+            say("timing all models in turns, in images described per second")
             (speed,) = do(_speed, (prepared, runs, quiet))
             write_json(out / "speed.json", speed)
         summary = summarise(prepared, runs, speed)

@@ -21,21 +21,21 @@ from crisalad_jax.utils.signals import defer_signals
 _MEMORY = 0.9
 """Fraction of a GPU's memory that all tasks on it may use together."""
 _TRIES = 10
-"""Number of times that a task may lose its worker."""
+"""Number of lost workers after which a task fails."""
 _PATIENCE = 300.0
 """Seconds that tasks have to save their work on an interruption; compiling may take minutes."""
 _JAX = (
     *("jax_platforms", "jax_num_cpu_devices", "jax_compilation_cache_dir"),
     "jax_persistent_cache_min_compile_time_secs",
 )
-"""JAX settings that workers inherit as environment variables, so that runs have the same bits."""
+"""JAX settings that workers inherit as environment variables, for bit-identical runs."""
 
 
 class Share(NamedTuple):
     """The share of a cluster that each task gets."""
 
     device: str
-    """What it reserves: "GPU", or "CPU" for cores."""
+    """What a task reserves: "GPU", or "CPU" for cores."""
     size: float
     """How many of these; a fraction where tasks share one."""
     at_once: int
@@ -106,7 +106,7 @@ def joined(
         if not ray.wait([first], timeout=START)[0]:
             raise InputError(
                 f"--cluster {address}: found no {share.size:g} free {share.device} within "
-                f"{START:.0f} s, expected that of a node for each run"
+                f"{START:.0f} s, expected as much on one node for each run"
             )
         yield share
 
@@ -124,7 +124,7 @@ def in_tasks(
     shared: tuple[Any, ...],
     each: Iterable[tuple[Any, ...]] = ((),),
 ) -> list[Any]:
-    """Do the same with tasks of the cluster; return the results in the order in which they finish.
+    """Do the work of `in_turn` in tasks of the cluster; return the results as they finish.
 
     Arguments are taken from `each` as tasks start. A task whose worker is lost is started again. On
     a signal, the tasks get Ctrl-C and time to save their work; a second signal does not wait for
@@ -165,7 +165,7 @@ def in_tasks(
                         words = f"a worker of the cluster was lost ({type(error).__name__})"
                         if lost[given] == _TRIES:
                             raise InputError(f"{words}, {_TRIES} times in the same work") from None
-                        warn(f"{words}; its work is begun again where it was saved")
+                        warn(f"{words}; its work resumes from what was saved")
                         again.append(given)
                     else:
                         results.append(result)

@@ -55,7 +55,7 @@ def recall_curves(
     Args:
         curves: fractions of the queries, 0 to 1, by name and K.
         title: title above the picture.
-        wide: whether it is for a page of its own, rather than one that is also read on phones.
+        wide: whether the figure is stand-alone, not part of a page that is also read on phones.
 
     Returns:
         The figure.
@@ -86,8 +86,7 @@ def precision_curves(curves: Mapping[str, PrecisionRecall]) -> Picture:
 def training_curves(records: Sequence[Mapping[str, int | float]]) -> Picture:
     """Draw a run: its losses, learning rate and validation recalls against the step.
 
-    Each of these that the records hold gets a panel. Long noisy series are pale, under their
-    running mean.
+    Each of these in the records gets a panel. Long noisy series are pale, under their running mean.
 
     Args:
         records: the lines of metrics.jsonl, each with "step" and any of "loss",

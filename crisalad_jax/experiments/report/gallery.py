@@ -90,8 +90,8 @@ def show_retrievals(
     if is_result != (benchmark is not None):
         raise InputError(
             f"benchmark: found {'none' if is_result else 'one'} for "
-            f"{'a result of evaluate' if is_result else 'answers of a map'}, expected it for "
-            "results alone"
+            f"{'a result of evaluate' if is_result else 'answers of a map'}, expected it only "
+            "for results"
         )
     count = len(found.neighbours.indices)
     right = np.ones(count, bool)
@@ -165,7 +165,7 @@ class _Tile(NamedTuple):
     file: Path
     caption: str
     colour: str = INK
-    """Of the caption, and of the frame if it is correct or wrong."""
+    """Colour of the caption, and of the frame of a correct or wrong retrieval."""
     name: str = ""
     joined: tuple[np.ndarray, np.ndarray] | None = None
     """Pixels of inliers in the query's file and in this one."""
@@ -234,8 +234,8 @@ def _draw(rows: Sequence[Sequence[_Tile]], title: str, *, strict: bool) -> Pictu
             images[file] = _Shown(box, 1.0)
     if lost:
         warn(
-            f"{counted(len(lost), 'picture')} shown as a grey box, as of {lost[0]}; --map-images "
-            "(root=) says where else"
+            f"{counted(len(lost), 'picture')} shown as a grey box (first: {lost[0]}); --map-images "
+            "(root=) sets another folder"
         )
     shapes = [image.pixels.shape for image in images.values()]
     aspect = float(np.median([shape[0] / shape[1] for shape in shapes]))

@@ -126,8 +126,8 @@ def show_image_attention(
     """Draw which images attend to which in each layer of the cross-image encoder.
 
     A row is an image that attends, a column one that it attends to. A cell is the attention weight,
-    averaged over tokens and heads, and written in percent for up to ten images. White is one over
-    the number of images.
+    averaged over tokens and heads, and written in percent for up to ten images. White is a uniform
+    share, one over the number of images.
 
     Args:
         images: image files or arrays, which are described together.

@@ -160,7 +160,7 @@ class Subject(NamedTuple):
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
     def metres(self, query: int, index: int) -> float | None:
-        """Measure the metres from a query to a database image; None without likely positions."""
+        """Measure the metres from a query to a database image; None without plausible positions."""
         places = self.positions
         if places is None:
             return None

@@ -33,7 +33,7 @@ RIGHT = "#2a8f3c"
 WRONG = "#c62828"
 UNMATCHED = "#7b1fa2"
 PLAIN = "#c4c4c4"
-"""For images that are none of these, such as the database's on a map."""
+"""Colour of other images, such as the database on a map."""
 # Okabe and Ito's colours, which the colour-blind can tell apart; without yellow, too light for
 # lines.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -83,7 +83,7 @@ def new_figure(height: float, title: str = "", *, width: float = 4.0, dpi: int =
 def label_axes(
     axes: Axes, x: str, y: str, *, grid: Literal["x", "y", "both"] = "y", title: str = ""
 ) -> None:
-    """Style axes: names, left and bottom spines, and pale grid lines across or along."""
+    """Style axes: names, left and bottom spines, and pale grid lines."""
     axes.set_xlabel(x, fontsize=10, color=INK)
     axes.set_ylabel(y, fontsize=10, color=INK)
     axes.set_title(title, fontsize=10, color=INK, loc="left")
@@ -95,7 +95,7 @@ def label_axes(
 
 
 def legend_below(figure: Figure) -> None:
-    """Name what is drawn below the axes, in two columns if the names are short enough."""
+    """Draw a legend below the axes, in two columns if its names are short enough."""
     names = [name for axes in figure.axes for name in axes.get_legend_handles_labels()[1]]
     room = figure.get_figwidth() / 2 - 0.6  # inches; a letter of 9 points is 0.08 wide
     columns = 2 if max(map(len, names)) * 0.08 <= room else 1

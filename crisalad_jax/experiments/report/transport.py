@@ -33,7 +33,7 @@ Image = str | os.PathLike[str] | Pixels
 def show_transport(image: Image, model: Model) -> Picture:
     """Draw a picture, each patch's share in the dustbin, and the cluster that took most of it.
 
-    The strongest seven clusters have colours; patches that went to others stay grey. A colour's
+    The seven strongest clusters have colours; patches that went to others stay grey. A colour's
     strength is the mass that clusters took from the patch. A transport without a dustbin has no
     middle panel.
 
@@ -104,7 +104,7 @@ def transport_of(image: Pixels, model: Model) -> Transported:
 
 
 def strongest_clusters(pictures: Sequence[Transported]) -> dict[int, float]:
-    """Find the clusters that take most mass from the patches that they win.
+    """Find the clusters that take the most mass from the patches that they win.
 
     A cluster wins a patch if it takes more of it than any other does. Each cluster comes with that
     mass as a share of all mass that clusters took, largest first. (Over all patches of an image
@@ -165,7 +165,7 @@ def draw_transport(
 
 
 def draw_panel(axes: Axes, image: Pixels, title: str, over: np.ndarray | None = None) -> None:
-    """Draw a photograph, or in grey with a value or a colour over each patch."""
+    """Draw a photograph; with `over`, in grey under a value or colour for each patch."""
     axes.set(xticks=[], yticks=[], anchor="N")
     axes.spines[:].set_visible(False)
     axes.set_title(title, loc="left", fontsize=9, color=INK)
@@ -181,7 +181,7 @@ def draw_panel(axes: Axes, image: Pixels, title: str, over: np.ndarray | None = 
 def _cluster_colours(
     picture: Transported, chosen: Sequence[int]
 ) -> Float[np.ndarray, "row column 4"]:
-    """Colour each patch by its top cluster, as RGBA; those of clusters not `chosen` are clear.
+    """Colour each patch by its top cluster, as RGBA; clusters not `chosen` are transparent.
 
     The opacity is the mass that clusters took from the patch, relative to the picture's largest.
     """

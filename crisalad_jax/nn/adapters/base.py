@@ -72,7 +72,7 @@ class Adapter(Part, abc.ABC):
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:
         """Draw the parameters of one block's adapter, a pytree of float32 arrays.
 
-        To leave a pretrained model unchanged at first, return parameters with which it adds 0.
+        To leave a pretrained model unchanged at first, return parameters that make the update 0.
         """
 
     def check(self, shape: BlockShape) -> None:

@@ -191,7 +191,7 @@ class SerialParallelConfig(BottleneckAdapter):
     def attention_update(
         self, params: SerialParallelAdapter, attended: AnyTokens, info: TokenInfo
     ) -> AnyTokens:
-        """Return the output of the serial MLP; adding it to its input is the skip."""
+        """Return the output of the serial MLP; the block adds the MLP's input (the skip)."""
         return _mlp(params.serial, attended)
 
     def mlp_update(

@@ -14,7 +14,7 @@ from crisalad_jax.nn.layers import TwoLayer, init_two_layer, powers
 class DynamicPowerConfig(Adapter):
     """SAGE's dynamic power after each of the last blocks: x + sign(x) (|x| + 1e-6)^p.
 
-    A small network computes the exponent p of an image, from 0 to 1, from the mean of all tokens.
+    A small network computes an image's exponent p, between 0 and 1, from the mean of all tokens.
     The power is discontinuous at 0, so values near 0 are sensitive to rounding.
     """
 

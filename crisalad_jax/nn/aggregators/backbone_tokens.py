@@ -77,7 +77,7 @@ class AggregationTokensConfig(Aggregator):
         return AggregationTokens(random_init.normal(key, (self.tokens, backbone.dim), scale=1e-6))
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> AggregationTokens:
-        """Make tokens as the authors do: centroids scaled as NetVLAD's initial score weights."""
+        """Make tokens as the authors do: centroids scaled like NetVLAD's initial score weights."""
         return AggregationTokens(scores_from_centroids(centroids, features).weight.T)
 
     def inserted(self, params: AggregationTokens) -> Float[Array, "token dim"]:

@@ -133,7 +133,7 @@ class Aggregator(Part, abc.ABC):
         raise NotImplementedError
 
     def with_frequencies(self, params: Any, images: Sequence[Any]) -> Any:
-        """Weight the centroids by how many images have each; by default return `params`.
+        """Weight the centroids by how many images contain each; by default return `params`.
 
         Args:
             params: from `from_centroids`.

@@ -117,7 +117,7 @@ class Whitening:
     components: Float[Array, "dim dim"]
     """Orthonormal rows."""
     variance: Float[Array, " dim"]
-    """Fitted descriptors' variance along components."""
+    """Variance of the fitted descriptors along the components."""
 
 
 @pytree_dataclass

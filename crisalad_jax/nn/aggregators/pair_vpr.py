@@ -47,7 +47,7 @@ class PairLayer:
     norm3: LayerNorm
     mlp: TwoLayer
     norm_other: LayerNorm
-    """Norm of the other image's tokens (never updated)."""
+    """Norm of the other image's tokens, which no layer updates."""
 
 
 @pytree_dataclass
@@ -91,7 +91,7 @@ class PairVprConfig(Aggregator):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        words = f"a multiple of its {self.heads} heads, one for every 64 numbers"
+        words = f"a multiple of its {self.heads} heads, one for every 64 dimensions"
         require_field(self, "width", self.width % self.heads == 0, words)
         square = math.isqrt(self.positions) ** 2 == self.positions
         require_field(self, "positions", square, "a square number")

@@ -94,7 +94,7 @@ class BoqConfig(Aggregator):
         return TokenShape(0, self.rows, self.channels)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Boq:
-        """Draw parameters as the public code does: standard normal queries, the rest as torch's."""
+        """Draw parameters as the public code does: standard normal queries, the rest like torch."""
         conv_key, blocks_key, rows_key = random_init.split(key, 3)
         keys = random_init.split(blocks_key, self.layers)
         return Boq(
@@ -194,7 +194,7 @@ class EdtFormerConfig(Aggregator):
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> EdtFormer:
         """Draw queries with deviation 1e-6, as published, and the rest as torch does.
 
-        All layers start equal: torch's `nn.TransformerDecoder` copies the layer it is given.
+        All layers start identical: torch's `nn.TransformerDecoder` copies the layer it is given.
         """
         queries, fc, layer_key, channels, rows = random_init.split(key, 5)
         keys = random_init.split(layer_key, 4)

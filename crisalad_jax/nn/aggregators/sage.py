@@ -36,7 +36,7 @@ class Sage:
     cluster_features: TwoLayer
     score: TwoLayer
     power: TwoLayer
-    """Network of the exponent."""
+    """Network that computes the exponent."""
 
 
 @AGGREGATORS.register(

@@ -1,4 +1,4 @@
-"""SelaVPR++: a generalised mean between linear layers, and a second, short one for bits.
+"""SelaVPR++: a generalised mean between linear layers, and a second, shorter head for bits.
 
 Written from facts about the public model (Lu et al. 2025, "SelaVPR++: Towards Seamless Adaptation
 of Foundation Models for Efficient Place Recognition").
@@ -56,9 +56,9 @@ class SelaVprPpHash:
     """The heads of both side paths."""
 
     real: SelaVprPp
-    """Of the first path: real values, which re-rank the first retrievals."""
+    """Head of the first path: real values, which re-rank the first retrievals."""
     hash: SelaVprPp
-    """Of the second path: the model's descriptor, for search by its bits."""
+    """Head of the second path: the model's descriptor, for search by its bits."""
 
 
 @AGGREGATORS.register("selavprpp-hash", tiny={"dim": 256, "bits": 128})

@@ -294,7 +294,7 @@ def scores_from_centroids(centroids: Centroids, features: FeatureRows) -> Linear
         features: unit vectors, or the vectors that the centroids were computed from.
 
     Raises:
-        InputError: all features are equally near to two centroids, for example if all are equal.
+        InputError: all features are equally near two centroids, for example if all are equal.
     """
     directions = l2_normalise(centroids)
     cosines = jnp.matmul(features, directions.T, precision="highest")
@@ -303,7 +303,7 @@ def scores_from_centroids(centroids: Centroids, features: FeatureRows) -> Linear
     # Below this the two differ only by rounding.
     if not gap > 1e-6:
         raise InputError(
-            f"features: found {len(features)} that are as near to two of {len(centroids)} "
+            f"features: found {len(features)} equally near two of {len(centroids)} "
             "centroids, expected features that differ"
         )
     return Linear(math.log(RATIO) / gap * directions.T, None)
@@ -339,7 +339,7 @@ def fit_reduction(features: FeatureRows, reduced: int) -> Reduction:
     require(
         min(features.shape) >= reduced,
         f"features: found {features.shape[0]} of width {features.shape[1]}, expected at least "
-        f"{reduced} of each, one for each component of VLAD-BuFF",
+        f"{reduced} features and dimensions, one for each component of VLAD-BuFF",
     )
     mean = features.mean(axis=0)
     centred = features - mean

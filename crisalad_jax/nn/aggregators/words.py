@@ -34,7 +34,7 @@ class HardVladConfig(WordsConfig):
     def sums(self, params: Words, patches: Patches) -> Float[Array, "*batch cluster dim"]:
         """Sum residuals from the nearest word, and normalise the sum of each cluster.
 
-        An image without features gets equal values.
+        Without features, all dimensions are equal.
         """
         shares = word_shares(params.words, patches)
         sums = l2_normalise(residual_sums(shares, patches, params.words))
@@ -46,14 +46,14 @@ class Bow:
     """The visual words and their weights."""
 
     words: Centroids
-    """k-means centroids of unit features; for binary ones bit majorities."""
+    """k-means centroids of unit features; for binary features, the majority of each bit."""
     weights: Float[Array, " cluster"]
     """log(N / n) of a word that n of the N vocabulary images contain."""
 
 
 @AGGREGATORS.register("bow", tiny={"clusters": 100})
 class BowConfig(Aggregator):
-    """Bags of visual words by tf-idf (Sivic and Zisserman, ICCV 2003)."""
+    """Bags of visual words with tf-idf weights (Sivic and Zisserman, ICCV 2003)."""
 
     trainable: ClassVar[bool] = False
     clusters: PositiveInt = 1000
@@ -77,7 +77,7 @@ class BowConfig(Aggregator):
         return Bow(centroids, jnp.ones(len(centroids)))
 
     def with_frequencies(self, params: Bow, images: Sequence[np.ndarray]) -> Bow:
-        """Return the words, weighted by log(N / n) over the features of these images."""
+        """Return the words, weighted by log(N / n) over these images."""
         has = [word_shares(params.words, jnp.asarray(each)).any(axis=0) for each in images]
         count = np.maximum(np.sum(has, axis=0), 1)
         return Bow(params.words, jnp.log(jnp.asarray(len(images) / count, jnp.float32)))
@@ -85,7 +85,7 @@ class BowConfig(Aggregator):
     def apply(self, params: Bow, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return each word's share of the patches of an image, times the word's weight.
 
-        An image without features gets equal values.
+        Without features, all dimensions are equal.
         """
         patches = l2_normalise(at_least_float32(features.patches))
         counts = word_shares(params.words, patches).sum(axis=-2)

@@ -169,7 +169,7 @@ class Backbone(Part, abc.ABC):
             InputError: the backbone has no adapters, or they cannot be merged.
         """
         raise InputError(
-            f"merge_adapters: found backbone {self.part_name}, expected one with adapters, as vit"
+            f"merge_adapters: found backbone {self.part_name}, expected one such as vit"
         )
 
     def adapt_checkpoint(self, config: Any, params: Any, fresh: Any) -> tuple[Any, Any]:

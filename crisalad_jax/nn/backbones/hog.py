@@ -23,7 +23,7 @@ class HogConfig(WholeImageBackbone):
 
     Sobel gradients of the grey image vote, by unsigned angle, linearly for the two nearest of 9
     bins. Cells have 8 x 8 pixels. Blocks of 2 x 2 cells, one cell apart, are divided by their L2
-    norms. An image without gradients gets equal values. There are no parameters: the class token is
+    norms. Without gradients, all dimensions are equal. There are no parameters: the class token is
     the descriptor. Preprocessing needs bytes, mean 0 and deviation 1/255.
     """
 

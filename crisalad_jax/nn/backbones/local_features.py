@@ -1,7 +1,7 @@
 """SIFT and ORB features in place of a network's patches, for heads that count visual words.
 
 The host extracts the features from photographs (`data.local_features`); here their bytes become
-vectors. If an image has fewer features, its last patches are 0.
+vectors. If an image has fewer than `count` features, its last patches are 0.
 """
 
 import abc

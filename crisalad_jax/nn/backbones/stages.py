@@ -1,4 +1,4 @@
-"""Convolutional backbones: a stem, and stages that each halve the grid."""
+"""Convolutional backbones: a stem, and stages that halve the grid."""
 
 import abc
 import dataclasses

@@ -63,7 +63,7 @@ class TetraVit:
     """The backbone. In `blocks`, the ternary ones, every leaf has a leading axis."""
 
     pos_embed: Float[Array, "token dim"]
-    """Class token's, then the patches' in row order."""
+    """Positions of the class token, then of the patches in row order."""
     cls_token: Float[Array, " dim"]
     patch_norm: LayerNorm
     patch_embed: Linear
@@ -92,7 +92,7 @@ class TetraVitConfig(Backbone):
         """Check the ranges."""
         words = f"a multiple of the {self.heads} heads"
         require_field(self, "dim", self.dim % self.heads == 0, words)
-        require_field(self, "depth", self.depth > 1, "at least 2, of which the last is not ternary")
+        require_field(self, "depth", self.depth > 1, "at least 2: the last is not ternary")
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return the rows and columns of patches, as in the position embeddings."""

@@ -51,7 +51,7 @@ WIDTHS = (64, 128, 256, 512)
 
 @pytree_dataclass
 class TransVprBlock:
-    """Attention and a feed-forward network. The output of `norm1` replaces its input."""
+    """Attention and a feed-forward network; `norm1` normalises the residual stream itself."""
 
     pre_norm: LayerNorm
     self_attn: Attention
@@ -66,7 +66,7 @@ class TransVprNet:
 
     convs: tuple[ConvNorm, ...]
     tokenizers: tuple[Conv, ...]
-    """Non-overlapping convolutions of each map to one grid."""
+    """Non-overlapping convolutions that bring every map to the same grid."""
     cls_token: Float[Array, " dim"]
     blocks: TransVprBlock
     norm: LayerNorm

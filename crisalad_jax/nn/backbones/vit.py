@@ -155,13 +155,13 @@ class VisionTransformer(Backbone):
         adapter, few = self.adapter, self.adapter.last is not None
         acts = isinstance(adapter, NoAdapter) or adapter.has(*HOOKS)
         require_field(self, "adapter", acts, f"one with a method {', '.join(HOOKS)}")
-        words = f"one of all blocks, which {adapter.part_name} with prompts has to be"
+        words = f"one in all blocks, because {adapter.part_name} has prompts"
         require_field(self, "adapter", not (few and adapter.has("prompts")), words)
         adapter.check(self.block_shape)
 
     @property
     def hidden(self) -> int:
-        """Hidden width of the feed-forward network; SwiGLU's 2/3 rounds up to a multiple of 8."""
+        """Hidden feed-forward width; for SwiGLU, 2/3 of it rounded up to a multiple of 8."""
         hidden = int(self.dim * self.mlp_ratio)
         return (int(hidden * 2 / 3) + 7) // 8 * 8 if self.ffn == "swiglu" else hidden
 
@@ -275,8 +275,8 @@ class VisionTransformer(Backbone):
                 are run; None uses the stored ones, without updating them.
 
         Returns:
-            (features, updated): if `valid` is given, the second holds the running statistics, and
-            None for all other leaves.
+            (features, updated): the second is `params`; if `valid` is given, it holds the running
+            statistics, and None for all other leaves.
 
         Raises:
             InputError: during tracing, if levels are out of order or exceed the number of blocks,
@@ -373,7 +373,7 @@ class VisionTransformer(Backbone):
         adapter = self.adapter
         require(
             adapter.has("merge"),
-            f"merge_adapters: found adapter {adapter.part_name}, expected one of weights, as lora",
+            f"merge_adapters: found adapter {adapter.part_name}, expected one such as lora",
         )
 
         def merged(layer: Block) -> Block:
@@ -419,8 +419,8 @@ class ViTConfig(VisionTransformer):
     position_grid: PositiveInt = 37
     """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
     position_resize: Literal["dinov2", "plain"] = "dinov2"
-    """How that grid is resized to an image's: as DINOv2's models do, antialiased if there are
-    registers; or plain, never antialiased."""
+    """How that grid is resized to the patches of an image: "dinov2" antialiases if there are
+    registers, "plain" never does."""
     position_init: Literal["random", "sincos"] = non_semantic_field("random")
     """Initialisation of the position embeddings if no weights are loaded."""
 
@@ -428,7 +428,7 @@ class ViTConfig(VisionTransformer):
         """Check the ranges."""
         super().__post_init__()
         fits = self.position_init != "sincos" or self.dim % 4 == 0
-        require_field(self, "dim", fits, "a multiple of 4 for a sin-cos start")
+        require_field(self, "dim", fits, "a multiple of 4 for position_init 'sincos'")
 
     def init_positions(
         self, key: PRNGKeyArray
@@ -678,7 +678,7 @@ def _layer_at(stack: Block, number: Int[Array, ""]) -> Block:
 def block(
     params: Block, tokens: TokenBatch, info: TokenInfo, config: VisionTransformer
 ) -> tuple[TokenBatch, Block]:
-    """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR.
+    """Run one block (paper Eq. 2), with LayerScale on the sum of MLP and adapter, as in CricaVPR.
 
     Args:
         params: the block.
@@ -739,8 +739,8 @@ def _check_merged(layer: Block, merged: Block, config: VisionTransformer) -> Non
         expected, found = adapted_linear(name, before, x, update), linear(after, x)
         require(
             bool(jnp.allclose(found, expected, rtol=1e-3, atol=1e-3 * jnp.abs(expected).max())),
-            f"adapter {config.adapter.part_name}: found `merge` to make another layer {name} than "
-            "`linear_update` does, expected the same",
+            f"adapter {config.adapter.part_name}: found `merge` and `linear_update` to disagree "
+            f"in layer {name}, expected the same layer",
         )
 
 

@@ -37,12 +37,12 @@ def check_inputs(
         scores: see `solve`.
         log_mu: see `solve`.
         log_nu: see `solve`.
-        numbers: epsilon and both taus, each one for all problems or one per problem; None is 1.
+        numbers: epsilon and both taus, a value for all problems or one per problem; None is 1.
         init: see `solve`.
         equal_totals: whether the masses of both sides must have the same total.
 
     Raises:
-        InputError: naming the argument, what was found and what was expected.
+        InputError: a check fails; the message names the argument.
     """
     shape = scores.shape
     rows, columns = shape[:-1], (*shape[:-2], *shape[-1:])
@@ -73,7 +73,7 @@ def check_inputs(
     shown = " ".join(str(epsilon).split())
     _check(f"epsilon found {shown}, expected at least {least:.1e}", lambda x: x >= least, epsilon)
     _check(
-        f"epsilon found {shown}, by which scores overflow, expected numbers that {wide} can hold",
+        f"epsilon found {shown}, which makes scores overflow, expected quotients in {wide}'s range",
         lambda scores, epsilon: jnp.isfinite(
             scores.astype(wide) / per_problem(jnp.asarray(epsilon), 2)
         ),
@@ -97,7 +97,7 @@ def check_inputs(
 
 
 def per_problem(numbers: Array, axes: int) -> Array:
-    """Append axes to an array of one number per problem; one number for all stays as it is."""
+    """Append axes to an array of one value per problem; one value for all stays as it is."""
     return jnp.expand_dims(numbers, tuple(range(-axes, 0))) if numbers.ndim else numbers
 
 
@@ -155,7 +155,7 @@ def _check_params(name: str, part: Any, params: Any, argument: str) -> None:
 
 
 def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
-    """Check that a step returns potentials of the problem's shapes and keeps its state's shapes.
+    """Check that a step returns potentials and a state of the shapes that it was given.
 
     Raises:
         InputError: it does not, or its parameters are missing; the message names the step.

@@ -27,13 +27,13 @@ class Gradient(Part):
     """A gradient of the potentials, through which JAX differentiates the plan."""
 
     at_convergence: ClassVar[bool | None] = None
-    """Whether it is the gradient of the converged plan, which needs a tolerance, or of a fixed
-    number of iterations, which has none; None fits both."""
+    """True: gradient of the converged plan, which needs a tolerance. False: gradient of a fixed
+    number of iterations, without a tolerance. None: either."""
     needs_entropic: ClassVar[bool] = False
     """Whether the step must solve the entropic problem (`Step.entropic`)."""
     takes_solver: ClassVar[bool] = False
-    """Whether `solve` takes the solver that is given to `sinkhorn.solve`, which then accelerates
-    instead of Anderson's method."""
+    """Whether `solve` takes the `solver` of `sinkhorn.solve`, which then replaces Anderson's
+    method."""
 
     def solve(
         self, problem: Problem, config: "SinkhornConfig", params: Any, init: Potentials

@@ -18,7 +18,7 @@ def solve_in_domain(
     problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
 ) -> Solution:
     """Iterate in the configured domain; scores too far apart for scaling use the log domain."""
-    # Leaving the scaling domain, out of its range, takes a branch.
+    # Leaving the scaling domain takes a branch.
     if config.domain == "log" or not target().branches:
         return iterate(problem, config, params, init)
     scaled = ScalingProblem.scaled(problem)
@@ -47,7 +47,7 @@ def solve_in_domain(
 
 @GRADIENTS.register("unrolled")
 class Unrolled(Gradient):
-    """Differentiate through the iterations: the exact gradient for their number."""
+    """Differentiate through the iterations: the exact gradient of that many iterations."""
 
     at_convergence: ClassVar[bool | None] = False
 

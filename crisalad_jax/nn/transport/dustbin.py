@@ -90,7 +90,7 @@ class NoDustbin(Dustbin):
 
 
 class ScalarDustbin(Dustbin):
-    """Base class of dustbins with one learnt number."""
+    """Base class of dustbins with one learnt scalar."""
 
     def init(self, key: PRNGKeyArray, dim: int) -> Array:
         """Start at 1: the score of the public implementation, or a logit whose share is 0.73."""
@@ -139,7 +139,7 @@ class TokenDustbin(Dustbin):
 
 @DUSTBINS.register("mass")
 class MassDustbin(ScalarDustbin):
-    """A column with learnt mass, as the logit of its share; clusters share the rest equally.
+    """A column with a learnt mass, given by its share's logit; clusters share the rest equally.
 
     The initial share is 0.73; the published one at 224 x 224 is 0.75.
     """

@@ -22,7 +22,7 @@ from crisalad_jax.utils.target import target
 
 UNROLLED = 8
 """Largest number of iterations that are unrolled on an accelerator; more become a scan. On a
-CPU all are a scan, which is as fast and compiles less."""
+CPU all are a scan, which is as fast and compiles faster."""
 
 
 _flat = functools.partial(jnp.concatenate, axis=-1)
@@ -45,7 +45,7 @@ def empty_memory(start: Potentials, size: int) -> Memory:
 
 
 def accelerate(memory: Memory, moved: Potentials, count: Int[Array, ""]) -> Memory:
-    """Store a step, and start the next from the mixture of past results with least residual.
+    """Store a step, and start the next from the mixture of past results with the least residual.
 
     Args:
         memory: the previous steps.
@@ -100,9 +100,6 @@ def iterate(
 
     Returns:
         The potentials, how many iterations it took, and whether the tolerance was met.
-
-    Raises:
-        InputError: while tracing, if the step returns potentials unlike the given ones.
 
     Example:
         >>> import jax.numpy as jnp

@@ -27,7 +27,7 @@ class NesterovStep(Step):
     semi-dual, which Nesterov's method accelerates (Soviet Math. Dokl. 1983; Xu and Chen,
     arXiv:2605.30267, have such a method with a proven rate). Here it is a plain extrapolation by
     t / (t + 3), where t restarts when the last move was against the gradient (O'Donoghue and
-    Candes, Found. Comput. Math. 2015). No gradient flows through the weights.
+    Candes, Found. Comput. Math. 2015). No gradient flows through t.
     """
 
     entropic: ClassVar[bool] = True

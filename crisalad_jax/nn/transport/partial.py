@@ -1,4 +1,4 @@
-"""Partial transport: only a share of the patches' mass moves, and the dustbin is the rest.
+"""Partial transport: only a share of the patches' mass moves, and the dustbin takes the rest.
 
 Entropic partial transport (Benamou et al., SIAM J. Sci. Comput. 2015) maximises <P, S> + epsilon *
 entropy(P) over plans P between patches and clusters that move a given total mass, and never exceed

@@ -79,8 +79,8 @@ class Problem:
     ) -> "Problem":
         """Make a problem from the scores over epsilon and the logarithms of the masses.
 
-        The logarithm of a mass of 0 is -inf, or any below -1e5. A tau that is an array is from
-        another problem, or has one number.
+        The logarithm of a mass of 0 is -inf, or any value below -1e5. An array tau has one value,
+        or the shape (*batch, 1) of `taus`.
         """
         one = (*kernel.shape[:-2], 1)
 

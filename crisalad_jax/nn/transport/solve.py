@@ -78,22 +78,22 @@ def solve(
     the scaling domain are solved again in the log domain.
 
     Rows and columns may have a mass of 0. Their entries of the plan and their gradients are then 0,
-    and the rest is as without them. The logarithm of such an entry is finite, and so low that its
-    exponential is 0.
+    and the rest is as if they were left out. The logarithm of such an entry is finite, and so low
+    that its exponential is 0.
 
     Every gradient but "optimistix" works in forward and reverse mode, and has higher derivatives.
     Under `vmap` every problem is solved in both domains: put a batch in the leading axes instead.
 
     Args:
         scores: finite; the gain of moving mass from a row to a column.
-        log_mu: logarithms of the rows' masses; -inf, or any below -1e5, for a mass of 0.
+        log_mu: logarithms of the rows' masses; -inf, or any value below -1e5, for a mass of 0.
         log_nu: logarithms of the columns' masses. If the step is `entropic` and neither tau is
             below 1, the masses must have the rows' total. Totals of half-precision masses may
             differ by their rounding: the columns then get the rows' total.
         epsilon: entropic regularisation, above 0: one for all problems of the batch, or one for
             each. It may be traced or learnt.
         row_tau: 1 for rows that meet their marginals; below 1 a Kullback-Leibler penalty of
-            epsilon * row_tau / (1 - row_tau) pulls them there. An array, of one number or one for
+            epsilon * row_tau / (1 - row_tau) pulls them there. An array, of one value or one for
             each problem, may be traced or learnt, and must stay below 1.
         column_tau: the same for columns.
         config: step, stopping rule and gradient. Static.
@@ -101,7 +101,7 @@ def solve(
             `config.start`. Those of rows and columns of mass 0 are not used.
         step_params: learnt parameters of the step (`Step.init_params`).
         start_params: learnt parameters of the start (`Start.init_params`).
-        solver: an optimistix solver, where the gradient is "optimistix".
+        solver: an optimistix solver, if the gradient is "optimistix".
 
     Returns:
         The plan's logarithm, the potentials, and how well the plan meets its marginals.

@@ -77,12 +77,13 @@ class ZeroStart(Start):
 class GaussianStart(Start):
     """Start at the potentials of two Gaussians, in closed form from the scores' spectrum.
 
-    Up to means of its rows and columns, a matrix of scores is one of inner products <x_n, y_k>, by
-    its singular vectors. If x and y were Gaussian, the entropic plan would be too, with quadratic
+    Up to row and column means, scores are inner products <x_n, y_k> of vectors from their singular
+    value decomposition. If x and y were Gaussian, the entropic plan would be too, with quadratic
     potentials (Janati et al., NeurIPS 2020; Thornton and Cuturi, AISTATS 2023, start from them).
     With masses that sum to 1, and G the columns' weighted second moments of the scores, the
-    columns' potential is log nu - mean - (sqrt(1 + 4 G) - 1)_kk / (4 nu_k): for small scores, half
-    a variance. It costs a product of the scores with themselves and an eigendecomposition.
+    columns' potential is log nu - mean - (sqrt(1 + 4 G) - 1)_kk / (4 nu_k); for small scores the
+    last term is half a variance. It costs a product of the scores with themselves and an
+    eigendecomposition.
     """
 
     def potentials(self, problem: Problem, params: Any) -> Potentials:
@@ -96,7 +97,7 @@ class GaussianStart(Start):
         some = jnp.sqrt(jnp.maximum(columns, jnp.finfo(columns.dtype).tiny))
         moments = moments * some[..., None] * some[..., None, :]
         bend = jnp.diagonal(_root(moments), axis1=-2, axis2=-1) - 1
-        # A column of little mass is far from Gaussian: no further than it would be by itself.
+        # By concavity, at most this column's correction without the others, even at small mass.
         guess = problem.log_nu - mean - bend / (4 * some**2)
         return from_columns(problem, guess)
 
@@ -122,11 +123,11 @@ def _root_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 
 @STARTS.register("network")
 class NetworkStart(Start):
-    """Start at Sinkhorn's first columns, moved by a small network of each column's statistics.
+    """Start at Sinkhorn's first column potentials, plus a small network's output for each column.
 
     Learnt starts are from Amos et al. (Meta optimal transport, ICML 2023). For each column, the
     network gets the first potential, and the mean, deviation and maximum of its scores; initially
-    it moves no column. It learns only with the gradient "unrolled".
+    it adds 0. It learns only with the gradient "unrolled".
     """
 
     hidden: PositiveInt = 16
@@ -141,7 +142,7 @@ class NetworkStart(Start):
         }
 
     def potentials(self, problem: Problem, params: dict[str, Array]) -> Potentials:
-        """Return the moved columns, and the rows that fit them."""
+        """Return the corrected columns, and the rows that fit them."""
         kernel, (row, _) = problem.kernel, problem.zeros()
         first = problem.column_tau * (problem.log_nu - problem.lse_rows(row))
         rows = jax.nn.softmax(problem.log_mu, axis=-1)

@@ -336,7 +336,7 @@ def solve_columns(
 
     The matrix is diag(masses / column_tau) - row_tau * shares^T plan. It is written as a Laplacian,
     which avoids cancellation. If both sides are balanced, the unknown of the heaviest column is 0:
-    a column without mass could not hold the others.
+    with that of a column without mass at 0, the matrix would be singular.
 
     Args:
         plan: masses.

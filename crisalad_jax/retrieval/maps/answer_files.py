@@ -85,7 +85,7 @@ def check_positions(
     if suffix != ".csv" and axes != AXES[1] and zone is None:
         raise InputError(
             f"{path}: found positions in {', '.join(axes)} without a zone of UTM, expected "
-            "degrees, or metres of a known zone; a file .csv has them as they are"
+            "degrees, or metres of a known zone; a .csv file takes them as they are"
         )
 
 

@@ -39,7 +39,7 @@ from crisalad_jax.utils.shapes import Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 MOST_CHANGED = 10**6
-"""Maximum images that one change may remove or move: its JSON record has room for them."""
+"""Maximum number of images that one change, a single JSON record, may remove or move."""
 
 
 class AppendableMap(Map):
@@ -70,7 +70,7 @@ class AppendableMap(Map):
         Args:
             names: names relative to `root` that are not in the map yet.
             sizes: sizes of their files, in bytes.
-            descriptors: unit vectors, or what else `search` takes; stored in the map's type.
+            descriptors: unit vectors, or anything else `search` takes; stored in the map's type.
             root: the folder of these images.
             positions: where they were taken, as far as known; those of another UTM zone are
                 converted to the map's.
@@ -136,7 +136,7 @@ class AppendableMap(Map):
             if not taken and len(gone) == len(self):
                 raise InputError(
                     f"{self.folder}: found all its {len(self)} images to be removed, expected at "
-                    "least one to stay: a map without images is none, so remove its folder instead"
+                    "least one to stay (to delete the map, remove its folder)"
                 )
             if len(gone) + len(new) > MOST_CHANGED:
                 raise InputError(
@@ -148,7 +148,7 @@ class AppendableMap(Map):
         self._segments.change(record, parts())
 
     def fitted_anew(self, positions: Positions) -> Positions:
-        """Return new positions in the map's axes and zone, or their own if no other image has one.
+        """Return new positions in the map's axes and zone, or in theirs if no other image has any.
 
         Raises:
             InputError: they don't fit the map's axes or zone, see `Positions.fitted`.
@@ -163,7 +163,7 @@ class AppendableMap(Map):
 
     def _check_there(self) -> None:
         if not self.exists:
-            raise InputError(f"{self.folder}: found the opened map gone, expected it in this place")
+            raise InputError(f"{self.folder}: found the opened map gone, expected it to be here")
 
     def _rows_of(self, numbers: Iterable[int]) -> list[int]:
         return self.removed.rows_of(np.fromiter(numbers, np.int64)).tolist()
@@ -229,7 +229,7 @@ def open_for_appending(
         stack.enter_context(lock(folder))
         existing = read_metadata(folder)
         if existing is not None and existing != metadata:
-            raise InputError(f"{folder}: found another map than was expected here")
+            raise InputError(f"{folder}: found a map with other metadata, expected that given")
         for each in (folder, folder / SEGMENTS):
             remove_temporaries(each)
         if existing is None:

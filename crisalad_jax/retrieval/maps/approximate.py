@@ -63,7 +63,7 @@ class Approximate(NamedTuple):
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
     is_served: bool = False
-    """Whether a server searches for candidates among what is left, however little that is."""
+    """Whether a server searches for candidates among what is left, however few."""
 
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors by ranking candidates exactly.
@@ -95,7 +95,7 @@ class Approximate(NamedTuple):
 def open_approximate(
     folder: pathlib.Path, segments: Segments, *, verify: bool
 ) -> Approximate | None:
-    """Open the approximate search of the map in `folder`; None if it has none of these images.
+    """Open the approximate search of the map in `folder`; None if there is none of these images.
 
     Raises:
         InputError: it is damaged or, if `verify` is set, has changed.
@@ -152,7 +152,7 @@ def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
         One of `SEARCHES`, and why it was chosen.
     """
     if dtype == "bits":
-        return "exact", "no other search is built of bits"
+        return "exact", "bits are only searched exactly"
     size, graph = count * length * np.dtype(dtype).itemsize, count * (4 * length + _LINK_BYTES)
     if size <= _EXACT_BYTES:
         return "exact", f"a query reads {size / 1e6:.1f} MB, of {_EXACT_BYTES / 1e6:.0f} MB at most"
@@ -178,7 +178,7 @@ def build_approximate(
     """
     count, store = len(segments), segments.store
     if isinstance(store, MilvusStore):
-        # Before the index changes, as FLAT compares all descriptors on the server.
+        # Before the index changes: with FLAT, the server compares all descriptors.
         measure = None if kind == "exact" else _measuring(store, count)
         store.build(kind, count, quiet=quiet)
         built = _served(store)
@@ -237,7 +237,7 @@ def _served(store: MilvusStore) -> Approximate | None:
 
 
 def _measuring(store: Store, count: int) -> Callable[[Approximate], float]:
-    """Find the exact neighbours of some images; return a function that measures recall of them."""
+    """Find the exact neighbours of some images; return a function that measures their recall."""
     from crisalad_jax.retrieval.faiss_index import recall_against_exact
 
     places = sample(count, min(SAMPLE, count), _SEED)

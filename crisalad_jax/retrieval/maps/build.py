@@ -135,8 +135,8 @@ def index(
     Args:
         model: a model from `load`, or a `Runtime`. The image size and types of an existing map take
             precedence.
-        images: the folder, searched with its subfolders; the map names images by their paths in it.
-            Or another source of images (docs/how-to/image-sources.md).
+        images: a folder, searched with its subfolders, or another source of images
+            (docs/how-to/image-sources.md); the map names images by their paths in it.
         out: the map's folder.
         weights: the file that the parameters come from, which queries load by default.
         fps: frames per second, if `images` is a video or log; None is 1.
@@ -245,7 +245,7 @@ def index(
     if result.added == result.images and describer.config.cross_image.attends:
         warn(
             f"{out}: a map describes images independently, and this model attends across them: "
-            "recalls that are published for batches are not the map's (`crisalad evaluate "
+            "recalls published for batches do not apply to the map (`crisalad evaluate "
             "--grouping single` measures those of single images)"
         )
     return result

@@ -1,4 +1,4 @@
-"""A map's calibration: the similarity, or number of inliers, from which its answers count."""
+"""A map's calibration: the minimum similarity, or number of inliers, for an answer to count."""
 
 import dataclasses
 import pathlib

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 _SAME = 0.99
 """Minimum similarity of two descriptors of one picture: batches, float16 and bits round them."""
 _NEAR = 10_000
-"""Number of names that are searched for one similar to a missing name."""
+"""Number of names among which to look for one similar to a missing name."""
 
 
 @brief

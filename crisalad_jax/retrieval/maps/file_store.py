@@ -85,7 +85,7 @@ class FileStore:
             begins = file.read(len(header))
         if begins != header or path.stat().st_size != size:
             raise InputError(
-                f"{path}: found other bytes than of {self._dtype} {shape}, expected the whole .npy "
+                f"{path}: found bytes other than {self._dtype} {shape}, expected the whole .npy "
                 "file that was written"
             )
         # As a plain array, to avoid what a `memmap` does at each indexing.
@@ -111,7 +111,7 @@ class FileStore:
             queries: unit vectors or packed bits.
             k: neighbours per query, from 1 to as many as are left.
             count: number of descriptors, including removed ones.
-            removed: descriptors to leave out; the result numbers the others as it does.
+            removed: descriptors to leave out; the result numbers the rest as `Removed` does.
         """
         if self._dtype == BITS:
             parts = (

@@ -1,4 +1,4 @@
-"""The images of a map, stored as columns: 48 bytes and a name for each, at any map size."""
+"""The images of a map, stored as columns: 48 bytes and a name for each."""
 
 import copy
 import functools
@@ -22,7 +22,7 @@ _BLOCK = 4096
 _NAMES = "utf-8", "surrogatepass"
 """Encoding of names; file names that are not UTF-8 have surrogates."""
 _RECENT = 4096
-"""Minimum number of names that are looked up in a dictionary before they are sorted too."""
+"""Minimum number of new names that a dictionary holds before they are sorted too."""
 
 
 @brief
@@ -102,7 +102,7 @@ class Images(Sequence[MapImage]):
         self.removed = NONE
         """The removed images, by their rows in the store, which no change alters."""
         self.parts: list[Part] = []
-        """In order."""
+        """The images that were appended together, in order."""
         self._firsts, self._ends, self._hashes, self._sizes = (_Column(np.int64) for _ in range(4))
         self._names, self._taken = _Column(np.uint8), _Column(np.float64)
         self._positions = _Column(np.float64, 2)
@@ -205,7 +205,7 @@ class Images(Sequence[MapImage]):
                 column is too short or too long.
         """
         if not isinstance(root, str) or not isinstance(added, str | None):
-            raise TypeError(f"found root {root!r}, expected text, and added {added!r}, a time")
+            raise TypeError(f"found root {root!r} and added {added!r}, expected text and a time")
         text = "".join(names)
         data = text.encode(*_NAMES)
         lengths = map(len, names if len(data) == len(text) else (n.encode(*_NAMES) for n in names))
@@ -269,7 +269,7 @@ class Images(Sequence[MapImage]):
         """
         rows = [*removed, *moved]
         if not all(isinstance(row, int) and 0 <= row < self.rows for row in rows):
-            raise ValueError(f"found rows beyond {self.rows} or no numbers")
+            raise ValueError(f"found rows that are not integers from 0 to {self.rows - 1}")
         if len(moved) != len(positions) or None in positions:
             raise ValueError(f"found {len(positions)} positions, expected {len(moved)}")
         new = copy.copy(self)

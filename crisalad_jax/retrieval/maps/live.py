@@ -79,8 +79,8 @@ def query_live(
     """Find the images of a map that are most similar to each frame of a live source.
 
     The programs are compiled before the first frame is taken, for frames of the source's size.
-    Additions and corrections to the map take effect from the next frame on, unless `sequence` has
-    begun to follow the camera through the map as it was.
+    Additions and corrections to the map take effect from the next frame on, except with `sequence`,
+    which follows the camera through the map as it was opened.
 
     Args:
         places: the map, open.

@@ -110,7 +110,7 @@ class Map:
         self.calibration: Calibration | None = None
         """Result of `calibrate`; None without one, or if the map is open for appending."""
         self.components = read_components(folder, metadata)
-        """Components that shorten descriptors and those of queries, if any."""
+        """Components that shorten the descriptors of images and queries, if any."""
         self._calibrated = False
         self._approximate: Approximate | None = None
         self._left_out = Where(), self.images, 0, Removed()
@@ -122,7 +122,7 @@ class Map:
         if (row := self.images.twice()) is not None:
             firsts = [span.first for span in self._segments.spans]
             path = self._segments.paths[bisect.bisect(firsts, row) - 1]
-            raise InputError(f"{path}: not a whole record of images: a name is there twice")
+            raise InputError(f"{path}: not a whole record of images: a name occurs twice")
         self._opened_at = os.stat(self._segments.folder)
         self._close = weakref.finalize(self, store.close)
 
@@ -165,7 +165,7 @@ class Map:
             opened.calibration = read_calibration(folder, metadata.model)
             if opened.calibration is not None and opened.changed > opened.calibration.created:
                 warn(
-                    f"{folder}: its images were changed ({opened.changed[:10]}) since its least "
+                    f"{folder}: its images were changed ({opened.changed[:10]}) since its minimum "
                     f"similarity was measured ({opened.calibration.created[:10] or 'unknown'}); "
                     "`crisalad calibrate` measures it again"
                 )
@@ -464,7 +464,7 @@ class Map:
                 yield sign_vectors(rows) if self.metadata.is_bits else rows
 
     def parts(self) -> Iterator[NewImages]:
-        """Yield the images left of each addition, for appending them to another map."""
+        """Yield the remaining images of each addition, for appending them to another map."""
         blocks = self.descriptors
         spans = zip(self.images.parts, itertools.pairwise(self.images.starts), strict=True)
         for part, (start, end) in spans:
@@ -492,8 +492,8 @@ class Map:
             verify: whether to read all descriptors, as `verify` does.
 
         Returns:
-            Numbers of images and positions, its folders, additions and extent, the model, its
-            settings, and where descriptors are.
+            Counts of images and positions, the map's folders, additions and extent, the model and
+            its settings, and where descriptors are.
 
         Raises:
             InputError: what `verify` raises.

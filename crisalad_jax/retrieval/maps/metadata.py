@@ -1,4 +1,4 @@
-"""The metadata of a map, in map.json: the model, its settings, where descriptors are.
+"""The metadata of a map, in map.json: the model, its settings, and where descriptors are.
 
 Nothing here imports JAX until `model_config` is called.
 """
@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # a map is searched without JAX
 METADATA, SEGMENTS = "map.json", "segments"
 """Names of the metadata's file, and of the folder of additions."""
 COMPONENTS = "pca.safetensors"
-"""Name of the components that shorten descriptors."""
+"""Name of the file of components that shorten descriptors."""
 _PARTS = (
     *(METADATA, SEGMENTS, COMPONENTS, LOCK, "calibration.json", "calibration-verified.json"),
     *("approximate", "similar", "added"),
@@ -45,8 +45,8 @@ class MapMetadata:
     weights: str = dataclasses.field(compare=False)
     """Where those weights were: a path, or a name in `starter.FILES`."""
     config: dict
-    """The model's configuration as JSON values, at the image size and in the type in which images
-    are described."""
+    """The model's configuration as JSON values, with the image size and data type of the map's
+    images."""
     descriptor_length: int
     store: str = "files"
     """Where descriptors are stored; see `store.store_name`."""
@@ -81,7 +81,7 @@ class MapMetadata:
     @property
     def length_words(self) -> str:
         """Length of a descriptor as text."""
-        return f"{self.descriptor_length} {'bits' if self.is_bits else 'numbers'}"
+        return f"{self.descriptor_length} {'bits' if self.is_bits else 'dimensions'}"
 
 
 def model_config(metadata: MapMetadata, folder: str | os.PathLike[str]) -> "ModelConfig":
@@ -182,7 +182,7 @@ def read_components(folder: pathlib.Path, metadata: MapMetadata) -> Pca | None:
     pca = load_pca(folder / COMPONENTS)
     if pca_hash(pca) != metadata.pca:
         raise InputError(
-            f"{folder / COMPONENTS}: found other components, expected those that {METADATA} says"
+            f"{folder / COMPONENTS}: found other components, expected those recorded in {METADATA}"
         )
     return pca
 
@@ -201,7 +201,7 @@ def check_model(
 ) -> None:
     """Check that a map was made by the model with the hash `digest`.
 
-    A warning says if the model is an int8 program of `quantised_from`, which made the map.
+    A warning says if it is an int8 program, quantised from the model that made the map.
 
     Raises:
         InputError: the hashes differ; the message has both.

@@ -1,7 +1,7 @@
 """Descriptors in Milvus: on a server, or in milvus-lite in this process, with the same code.
 
-Rows are upserted, so that a call whose acknowledgement was lost can be repeated. Milvus has written
-an acknowledged row to its log; searches here see what was acknowledged before.
+Rows are upserted, so that a call whose acknowledgement was lost can be repeated. Milvus writes rows
+to its log before acknowledging them; searches here see all rows acknowledged before.
 """
 
 import contextlib
@@ -43,8 +43,8 @@ _ANSWER = 120.0
 _STALLED = 1800.0
 """Seconds without progress before giving up on an index: a segment of a GB takes some minutes."""
 _PASSING = (2, 101, 103, 106, 503, 700)
-"""Milvus' error codes of a server that is coming back, but that it does not call retriable: no
-connection; a collection that is not loaded, or whose index is being built; a channel."""
+"""Error codes of a server that is coming back, which Milvus does not call retriable: no connection;
+a collection that is not loaded, or whose index is being built; an unavailable channel."""
 # The last one logs a call that milvus-lite lacks and whose failure the client expects.
 _LOGS = ("pymilvus.decorators", "pymilvus.client", "milvus_lite.server_manager", "grpc._server")
 
@@ -76,7 +76,7 @@ KINDS = {
 """How Milvus searches: by comparing all, in memory; by a graph, in memory; by codes of a bit and a
 byte per dimension, in memory; by a graph on disk. HNSW has the parameters of maps in files."""
 _FEW, _GRAPH_BYTES = 50_000, 2**34
-"""Maximum descriptors that are compared one by one, and maximum size of those in a graph."""
+"""Maximum number of descriptors compared one by one, and maximum bytes of those in a graph."""
 
 
 def choose_kind(count: int, length: int, version: tuple[int, ...]) -> str:
@@ -257,7 +257,7 @@ class MilvusStore:
         """
         if kind == "auto":
             kind = choose_kind(count, self._length, self._version)
-            what = f"{count} descriptors of {self._length} numbers, Milvus {self._server}"
+            what = f"{count} descriptors of {self._length} dimensions, Milvus {self._server}"
             warn(f"{self._address}: --search auto takes {kind}: {what}")
         known = [name for name, each in KINDS.items() if each.since <= self._version]
         choose(f"search in Milvus {self._server}", kind, dict.fromkeys(known))
@@ -307,7 +307,7 @@ class MilvusStore:
             )
 
     def _fetch(self, doing: str, method: str, condition: str, **options: Any) -> Any:
-        """Query or search; see everything that was acknowledged before the first call."""
+        """Query or search everything that was acknowledged before the first call."""
         self._load()
         if self._since is None:
             with self._one_line("asking for its time"):
@@ -345,7 +345,7 @@ class MilvusStore:
 
         Milvus searches its FLAT index; with other indices, all descriptors are read and compared.
         """
-        require(k <= _MOST, f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
+        require(k <= _MOST, f"k: found {k}, expected at most {_MOST}, the limit of Milvus")
         if self.kind != "exact":
             return self._search_here(queries, k, count, removed)
         left = min(count - len(removed.rows), _MOST)

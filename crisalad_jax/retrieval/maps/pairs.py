@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # pairs among a map's images need no JAX
     from crisalad_jax.nn.model import Model
 
 _NUMBERS = 2**25
-"""Pairs of a query and an image that are processed together, one byte each."""
+"""Maximum number of pairs of a query and an image processed together, one byte each."""
 
 _Pair = tuple[str, str]
 
@@ -91,7 +91,7 @@ def image_pairs(
         k: pair each image with its k most similar ones; 0 turns this rule off.
         min_similarity: minimum similarity of these.
         min_gap: minimum time in seconds between these, from the times in their names (loop
-            closures). Times in two videos, or by two clocks, are far enough apart.
+            closures). Times in different videos, or by different clocks, are far enough apart.
         overlap: pair each image of the map with this many next ones of its folder or video.
         within: pair images of the map that were taken at most this many metres apart.
         root: folder that names are relative to; None is that of the images or, if there are
@@ -250,7 +250,7 @@ def _similar(
             mine = _moments(asked, clocks)
             gaps = np.abs(mine[1][:, None] - known[1])
             excluded |= (mine[0][:, None] == known[0]) & (gaps < min_gap)
-        # These include the k, however many of the nearest are left out.
+        # Enough to include the k, however many of the nearest are left out.
         found = places.search(rows, k + int(excluded.sum(axis=1).max()))
         for row, (indices, similarities) in enumerate(zip(*found, strict=True)):
             right = ~excluded[row, indices] & (similarities.astype(np.float64) >= least)
@@ -265,7 +265,7 @@ def _moments(
     without = [name for name, moment in zip(names, moments, strict=True) if moment is None]
     if without:
         raise InputError(
-            f"min gap: found {without[0]!r}, which says no time ({len(without)} such of "
+            f"min gap: found {without[0]!r} without a time ({len(without)} such of "
             f"{len(names)}), expected seconds since 1970 in names, or frames of videos"
         )
     pairs = [(clocks.setdefault(at.clock, len(clocks)), at.seconds) for at in moments if at]

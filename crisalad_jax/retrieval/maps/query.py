@@ -58,7 +58,7 @@ class Answers(NamedTuple):
     images: Sequence[MapImage]
     """All images of the map, by number."""
     axes: tuple[str, str] | None
-    """Axes of a position's two numbers; None if no image has a position."""
+    """Axes of the positions; None if no image has one."""
     unreadable: Sequence[pathlib.Path] = ()
     """Image files that could not be read, which have no answers."""
     min_similarity: float | None = None
@@ -152,7 +152,7 @@ def query(
             describes each independently, like a map's images.
         exact: whether to search exactly even if the map has an approximate search.
         min_similarity: a query is of an unknown place if no image is this similar to it; see
-            `Answers.known`. None is the map's calibration or, without one, -1: it accepts all.
+            `Answers.known`. None is the map's calibration or, without one, -1, which accepts all.
         sequence: a filter over the map's images in order, for queries that are consecutive frames
             of one camera; None answers every query independently.
         where: which images of the map to search, such as "folder=monday, added>=2026-05-01"
@@ -235,15 +235,15 @@ def asking(
 ) -> Ask:
     """Return a function that finds k answers: by the map's search, or by a filter over frames.
 
-    If more than k are to be verified, it finds as many, of which `verified` returns k.
+    If more than k are to be verified, it finds that many, of which `verified` returns k.
 
     Raises:
-        InputError: conditions that no image meets, or for such a filter, which needs all images.
+        InputError: conditions that no image meets, or with a filter, which needs all images.
     """
     if verifier is not None:
         k = max(k, verifier.verify.answers)
     if where is not None:
-        require(sequence is None, f"where: found {where} with a sequence, expected one of both")
+        require(sequence is None, f"where: found {where} with a sequence, expected only one")
         places.left_out(where)
     if sequence is None:
         return lambda descriptors, _: places.search(descriptors, k, exact=exact, where=where)

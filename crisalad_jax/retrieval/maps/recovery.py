@@ -1,4 +1,4 @@
-"""Descriptors of a map without a record, left by a killed addition or by the loss of a record."""
+"""A map's descriptors without a record, left by a killed addition or by the loss of a record."""
 
 import pathlib
 
@@ -32,9 +32,9 @@ def remove_unrecorded(folder: pathlib.Path, images: int) -> None:
         lost += unrecorded
     if lost:
         raise InputError(
-            f"{lost[0]}: found it in a map with records of {images} images alone, expected the "
-            "records of all images that were there: put them back, or make a new map"
+            f"{lost[0]}: found it in a map with records of only {images} images, expected the "
+            "records of all its images: restore them, or make a new map"
         )
     for path in unrecorded:
         path.unlink()
-        warn(f"{path}: descriptors without a record are removed, as of a kill or of a lost record")
+        warn(f"{path}: removed descriptors without a record, left by a kill or a lost record")

@@ -16,8 +16,8 @@ class Removed(NamedTuple):
     rows: Int64[np.ndarray, " removed"] = np.empty(0, np.int64)
     """In ascending order."""
     asked: "tuple[Where, Int64[np.ndarray, ' removed']] | None" = None
-    """The same selection for a database: conditions on images as they were added, and the rows
-    removed in addition. None if there is no such form."""
+    """The same selection for Milvus: conditions on images as they were added, and the rows that
+    were also removed. None if it has no such form."""
 
     def has(self, row: int) -> bool:
         """Return whether a row was removed."""
@@ -34,7 +34,7 @@ class Removed(NamedTuple):
         return numbers + np.searchsorted(left_before, numbers, side="right")
 
     def left(self, first: int, count: int) -> Int64[np.ndarray, " left"] | None:
-        """Return the places that are left of `count` rows from `first` on; None if all are."""
+        """Return which of `count` rows from `first` on remain, by place; None if all do."""
         start, end = np.searchsorted(self.rows, [first, first + count])
         gone = self.rows[start:end] - first
         return np.delete(np.arange(count), gone) if gone.size else None

@@ -29,7 +29,7 @@ def check_store(name: str, dtype: str) -> None:
     """Check the name of a store, and that it can hold descriptors of a type.
 
     Raises:
-        InputError: neither "files" nor "milvus:URI", or a URI or type that Milvus lacks.
+        InputError: neither "files" nor "milvus:URI", or a URI or type that Milvus does not take.
     """
     if name != "files":
         require(name.startswith(_MILVUS), f"store: found {name!r}, expected files or milvus:URI")

@@ -111,7 +111,7 @@ class Where:
             counts = ", ".join(f"{count} by {name}" for name, count in left.items())
             raise InputError(
                 f"where: found none of {len(images)} images ({counts}), expected at least one; "
-                "`crisalad map list` has the map's folders and times"
+                "`crisalad map list` shows the map's folders and times"
             )
         as_added = self.box is None or not images.has_moved
         return out._replace(asked=(self, images.removed.rows)) if as_added else out

@@ -23,7 +23,7 @@ def shape(config: ModelConfig) -> tuple[int, int]:
     require(
         tokens > 0,
         f"rerank: found a model with aggregator {config.aggregator.part_name}, which has no local "
-        "tokens, expected one that has, such as salad",
+        "tokens, expected one that has them, such as salad",
     )
     return tokens, dim
 

@@ -34,7 +34,7 @@ _LEAST_MATCHES = 4
 def mutual_matches(
     query: Float[AnyArray, "m d"], candidate: Float[AnyArray, "n d"], above: float = -math.inf
 ) -> Int[Array, " m"]:
-    """Match mutual nearest patches: for each patch of the query, find that of the candidate.
+    """Match mutual nearest patches: find the candidate's patch for each patch of the query.
 
     The nearest patch has the largest inner product; ties go to the first. The result is -1 where no
     match has a product larger than `above`. Patches of zeros match nothing.

@@ -51,7 +51,7 @@ def windows_of(config: ModelConfig) -> list[tuple[int, float, Grid]]:
         height, width = config.input_size
         raise InputError(
             f"patch-netvlad: found images of {height} x {width}, expected at least {smallest} x "
-            f"{smallest}, of which 2 x 2 of the smallest windows fit"
+            f"{smallest}, in which 2 x 2 of the smallest windows fit"
         )
     return fitting
 

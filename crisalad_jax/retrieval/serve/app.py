@@ -115,7 +115,7 @@ class Verified:
     inliers: int
     matches: int
     confidence: float
-    """From 0 to 1; at 1 both are views of one scene."""
+    """From 0 to 1; at 1 both count as views of one scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,7 +242,7 @@ class _NewImage(pydantic.BaseModel, extra="forbid"):
         axes: Any = tuple(given)
         if axes not in AXES:
             pairs = ", or ".join(" and ".join(pair) for pair in AXES)
-            raise InputError(f"position: found {', '.join(axes)}, expected {pairs}, or none of it")
+            raise InputError(f"position: found {', '.join(axes)}, expected {pairs}, or none")
         return Positions(axes, {self.name: tuple(given.values())})
 
 
@@ -304,7 +304,7 @@ def make_app(
     checking = ThreadPoolExecutor(1, "verify")
     verifier = None if rerank is None else Verifier(rerank)
     thumbnail = functools.lru_cache(_THUMBNAILS)(read_thumbnail)
-    # For one map, with and without verification: a calibration of inliers is a file.
+    # Cached with and without verification: a calibration of inliers is read from a file.
     thresholds = functools.lru_cache(2)(asked_thresholds)
     waiting = asyncio.Semaphore(most_waiting)
 
@@ -437,7 +437,7 @@ def make_app(
     async def append(request: Request, asked: Annotated[_NewImage, Query()]) -> Appended:
         """Append a picture to the map permanently; answers include it from then on."""
         if not appends:
-            raise HTTPException(403, "images: found a map that is only read, expected --append")
+            raise HTTPException(403, "images: found a read-only map, expected --append")
         check_new_name(asked.name)
         position = asked.position()
         data, _ = await receive_picture(request, max_bytes)
@@ -503,7 +503,7 @@ def bracketed(host: str) -> str:
 async def _room(free: asyncio.Semaphore) -> AsyncIterator[None]:
     """Hold a slot while the block runs, or refuse the request."""
     if free.locked():
-        reason = "found too many requests that wait, try again"
+        reason = "found too many waiting requests, try again"
         raise HTTPException(503, reason, {"Retry-After": "1"})
     async with free:
         yield

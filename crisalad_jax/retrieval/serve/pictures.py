@@ -41,7 +41,7 @@ _PLAIN = ("JPEG", "MPO", "PNG", "WEBP", "BMP", "PPM")
 _MOST_SCANS = 32
 """Maximum scans of a JPEG: encoders write about ten, and each takes as long as a plain JPEG."""
 _SIDE = 480
-"""Longer side of a thumbnail in pixels, at most."""
+"""Maximum length of a thumbnail's longer side, in pixels."""
 Image.MAX_IMAGE_PIXELS = None  # `check_picture` has its own limit, and decodes nothing
 
 
@@ -78,7 +78,7 @@ async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str
     except UnicodeError as error:  # from a charset that the form names
         raise HTTPException(400, f"image: found a form of another charset: {error}") from error
     except TimeoutError as error:
-        raise HTTPException(408, f"image: found half of it after {_PATIENCE:g} s") from error
+        raise HTTPException(408, f"image: found only part of it after {_PATIENCE:g} s") from error
 
 
 def check_picture(data: bytes, name: str, most_pixels: int) -> float:

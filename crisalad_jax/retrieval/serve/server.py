@@ -41,9 +41,9 @@ logging.getLogger("python_multipart").setLevel(logging.ERROR)
 _GRACE = 30
 """Seconds after a signal until requests in flight are dropped."""
 _HEAD, _EXCHANGE = 10, 120
-"""Seconds for the head of a request to arrive, and for all of it, and for its answer to be read."""
+"""Seconds for the head of a request to arrive; and for all of it, or for its answer to be read."""
 _MOST_CONNECTIONS, _ACCEPTED, _QUEUE = 256, 2, 2048
-"""Maximum connections, those accepted at once, and those that wait for that in the kernel."""
+"""Maximum number of connections open, accepted at once, and waiting in the kernel."""
 _SHORTEST_TOKEN = 16
 
 
@@ -77,7 +77,7 @@ def serve_map(
         weights: the model that made it; None is the file that was used then.
         engine: "jax", "onnxruntime" or "openvino"; or "auto", the one that `Map.fastest_engine`
             chooses.
-        host: name or address to listen on. Any other than this machine's needs a token.
+        host: name or address to listen on. Any that others can reach needs a token.
         port: port to listen on; 0 picks a free one.
         token: token that requests must send as `Authorization: Bearer ...`; None for no token.
         k: default number of answers to a picture.
@@ -166,7 +166,7 @@ class _Connection(H11Protocol):
             oldest = min(waiting, key=lambda each: each.since)
             connections.discard(oldest)
             oldest.transport.abort()
-            warn(f"found more than {most} connections at once: those that wait longest are ended")
+            warn(f"found more than {most} connections at once: closing those that wait longest")
 
     def on_response_complete(self) -> None:
         """Wait for the next request."""
@@ -258,8 +258,8 @@ def _check_access(host: str, token: str | None) -> None:
     if token is not None:
         if len(token) < _SHORTEST_TOKEN or not all("!" <= letter <= "~" for letter in token):
             raise InputError(
-                f"token: found {len(token)} letters, expected at least {_SHORTEST_TOKEN} of ASCII "
-                "without spaces, as of `openssl rand -hex 16`"
+                f"token: found {len(token)} characters, expected at least {_SHORTEST_TOKEN}, in "
+                "ASCII without spaces, as from `openssl rand -hex 16`"
             )
     elif not is_loopback(host):
         raise InputError(

@@ -100,10 +100,10 @@ class MapWorker:
         """Queue work.
 
         Returns:
-            For a question, the map that was searched, and (number, similarity) of its k most
-            similar images; for an addition, its number. It raises `InputError` for conditions that
-            no image meets and for an addition that the map refuses, including `NameTakenError`, and
-            `MapFailedError` for everything else.
+            A future: for a question, of the map that was searched, and (number, similarity) of its
+            k most similar images; for an addition, of its number. It raises `InputError` if no
+            image meets the conditions or the map refuses the addition (`NameTakenError` for its
+            name), and `MapFailedError` for everything else.
         """
         result: Future[Any] = Future()
         self._waiting.append((work, result))

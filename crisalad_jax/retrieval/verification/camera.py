@@ -31,7 +31,7 @@ _EXPECTED = (
 class Intrinsics:
     """A pinhole camera, with its lens distortion and the size of its images if these are known.
 
-    Images of another size are treated as scaled if they have the same aspect.
+    Images of another size are treated as scaled if they have the same aspect ratio.
 
     Example:
         >>> Intrinsics.parse("400,400,320,240,640,480").width
@@ -106,8 +106,8 @@ class Intrinsics:
             name: name of the image, for messages.
 
         Raises:
-            InputError: the camera's images have another aspect, or its principal point is not in
-                the image.
+            InputError: the camera's images have another aspect ratio, or its principal point is not
+                in the image.
         """
         height, width = size
         factor = 1.0 if self.width is None else width / self.width
@@ -120,7 +120,7 @@ class Intrinsics:
         require(
             fits,
             f"intrinsics: found a camera {own}with its centre at ({self.cx:g}, {self.cy:g}), and "
-            f"{name} of {width} x {height}, expected the camera's size or its aspect",
+            f"{name} of {width} x {height}, expected the camera's size or aspect ratio",
         )
         matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
         if not len(points):

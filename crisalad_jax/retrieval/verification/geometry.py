@@ -142,7 +142,7 @@ def pose_on_map(
     here: Sequence[float],
     there: Sequence[float],
 ) -> MapPose:
-    """Place a camera on a map, from an answer and the vector to another; all are level.
+    """Place a camera on a map, from an answer and the vector to another; all cameras are level.
 
     Args:
         pose: pose from the camera to the answer's, in metres.

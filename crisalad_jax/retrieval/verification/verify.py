@@ -98,7 +98,7 @@ class _View(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """Scale from pixels of the image to pixels of distances; thumbnails are not enlarged."""
+        """Scale from the image to the size at which distances are in pixels; at most 1."""
         return min(1.0, SIDE / max(self.size))
 
 
@@ -280,7 +280,7 @@ class Verifier:
         if depth is None or dtype != np.uint16 or abs(len(depth) - factor * height) >= 1:
             raise InputError(
                 f"{file}: found {dtype} of shape {shape}, expected millimetres in 16 bits, grey, "
-                f"of the aspect of {view.name}, {width} x {height}"
+                f"of the aspect ratio of {view.name}, {width} x {height}"
             )
         columns, rows = np.rint((points + 0.5) * factor - 0.5).astype(int).T
         return depth[rows.clip(0, len(depth) - 1), columns.clip(0, depth.shape[1] - 1)] / 1000
@@ -302,8 +302,8 @@ def order_by_inliers(
     """Return the order of verified answers, best first.
 
     An inlier counts as a similarity of 0.002, and at most 50 count: up to 0.1. Ranking only by
-    inliers is worse than ranking only by similarity where local features find few, as between
-    seasons (docs/verification.md has the numbers).
+    inliers is worse than ranking only by similarity where few local features match, as between
+    seasons (docs/verification.md has the figures).
     """
     scores = similarities + _INLIER * np.minimum(inliers, _MOST_INLIERS)
     return np.argsort(-scores, kind="stable")

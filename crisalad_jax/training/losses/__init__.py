@@ -1,6 +1,6 @@
 """Losses on the descriptors of a batch, and the miner that chooses which pairs enter them.
 
-Each equals the pytorch-metric-learning loss of the same name on unit descriptors.
+Where pytorch-metric-learning has the same loss, the values are equal on unit descriptors.
 """
 
 import importlib

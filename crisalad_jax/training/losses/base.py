@@ -157,7 +157,7 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
 
 
 def check_value(value: Any, name: str) -> None:
-    """Check that a loss has returned numbers, in float32 at least; `name` is for messages."""
+    """Check that a loss has returned scalars, in float32 or float64; `name` is for messages."""
     dtype = getattr(getattr(value, "loss", None), "dtype", None)
     number: Any = jax.ShapeDtypeStruct((), jnp.float64 if dtype == jnp.float64 else jnp.float32)
     has_accuracy = getattr(value, "accuracy", None) is not None
@@ -184,7 +184,7 @@ def mean_of_positive(losses: Float[Array, "*shape"]) -> Float[Array, ""]:
 
 
 def log_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Array, " anchor"]:
-    """Compute log(sum of exp(x)) over the chosen entries; 0, with a finite gradient, for none."""
+    """Compute log(sum of exp(x)) over the chosen entries; 0, with a finite gradient, if none is."""
     some = where.any(axis=1, keepdims=True)
     # A row without chosen entries sums all of them, to a finite number that is not used.
     chosen = jnp.where(where | ~some, x, -jnp.inf)

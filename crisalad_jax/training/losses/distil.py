@@ -21,7 +21,7 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 
 @LOSSES.register("distil")
 class DistilConfig(Loss):
-    """Distillation from a teacher's descriptors of the same images, which can be longer.
+    """Distillation from a teacher's descriptors, possibly longer ones, of the same images.
 
     The loss is a weighted sum of four terms; a term of weight 0 is not computed. Only `labels`
     uses the images' places.
@@ -52,7 +52,7 @@ class DistilConfig(Loss):
         require_field(self, "cosine", weights > 0, "above 0, or another term's weight")
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Linear | None:
-        """Draw the projection to the teacher's length."""
+        """Draw the projection to the teacher's descriptor length."""
         return init_linear(key, dim, self.teacher_dim) if self.cosine else None
 
     def apply(self, params: Linear | None, batch: LossBatch) -> LossValue:

@@ -55,7 +55,7 @@ class LossResult(NamedTuple):
     accuracy: Float[Array, ""] | None = None
     """Share of the images whose nearest class is their own; None for losses of pairs."""
     numbers: Mapping[str, Array] | None = None
-    """The loss's own (`LossValue.numbers`)."""
+    """Other scalars of the loss (`LossValue.numbers`)."""
 
 
 @takes(config=LossConfig)
@@ -73,7 +73,7 @@ def metric_loss(
 ) -> LossResult:
     """Compute the loss `config.kind` over the pairs that `config.miner` chooses.
 
-    The miner passes no gradient.
+    No gradient flows through the miner.
 
     Args:
         descriptors: unit vectors; their inner products are the similarities.
@@ -81,7 +81,7 @@ def metric_loss(
         config: the loss, its miner and their constants.
         valid: images that take part; None means all. The others are in no pairs.
         params: the loss's own trainable parameters (`Loss.init`).
-        classes: number of classes, if `params` have a vector for each, then padding.
+        classes: number of classes, if `params` have a vector for each, followed by padding.
         pairs: the pairs to choose from, such as `tuple_pairs`; None means `all_pairs`.
         tokens: local tokens or features of each image, for a loss that compares them.
         targets: a teacher's unit descriptors of the images, for a loss that compares them.
@@ -109,7 +109,7 @@ def metric_loss(
     learns = params is None and jax.eval_shape(init, jax.random.key(0)) is not None
     found = 0 if tokens is None else tokens.shape[1]
     for lacks, what in (
-        (kind.of_tuples and pairs is None, "tuples, expected the pairs of mined ones"),
+        (kind.of_tuples and pairs is None, "tuples, expected the pairs of `tuple_pairs`"),
         (
             kind.reads_tokens and not found,
             f"tokens, expected the aggregator's Tokens.{kind.reads_tokens}",

@@ -10,7 +10,7 @@ from crisalad_jax.training.losses.base import Pairs, Similarities
 
 
 def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None) -> Pairs:
-    """Find all pairs of `valid` images, of the same place and of two places.
+    """Find all pairs of `valid` images: from the same place, and from two places.
 
     Args:
         labels: the place of each image.
@@ -62,7 +62,7 @@ def mine(similarities: Similarities, pairs: Pairs, *, margin: float) -> Pairs:
 
 
 class Role(enum.IntEnum):
-    """What an image is in its tuple."""
+    """The role of an image in its tuple."""
 
     QUERY = 0
     POSITIVE = 1

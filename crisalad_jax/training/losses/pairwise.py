@@ -161,7 +161,7 @@ class FastAPConfig(Loss):
 
 @LOSSES.register("selavpr")
 class SelaVprLoss(Loss):
-    """The loss of Lu et al. (ICLR 2024), whose margin of local features is 0."""
+    """The loss of Lu et al. (ICLR 2024), with a margin of 0 for local features."""
 
     of_tuples: ClassVar[bool] = True
     reads_tokens: ClassVar[Literal["local", "dense"]] = "dense"
@@ -198,7 +198,7 @@ def mutual_similarity(
         second: unit features of another.
 
     Returns:
-        The mean; there is always such a pair.
+        The mean; there is always at least one such pair of features.
 
     Example:
         >>> float(mutual_similarity(jnp.eye(3)[:2], jnp.eye(3)[1:]))

@@ -91,7 +91,7 @@ def recipe(
     base, part = split_name(name)
     found = find_part(part, preset)
     if base is None:
-        warn(f"recipe: found {name}, which is a part: crisalad+{name}, CriSALAD with it in place")
+        warn(f"recipe: found part {name}; using crisalad+{name}, CriSALAD with this part")
     return with_part(_of_model(RECIPES[base or "crisalad"](size, preset), model), found)
 
 
@@ -118,8 +118,8 @@ def model_of(
     """Make the model of a published method, without a cross-image encoder.
 
     Training images are resized as `PreprocessingConfig.for_training` says, whatever is set here. A
-    model that normalises by local contrast, such as `tiny`, takes only the filter: it is not a
-    published one.
+    model that normalises by local contrast, such as `tiny`, takes only the filter, because it is
+    not a published model.
 
     Args:
         model: the preset's model.

@@ -10,24 +10,24 @@ from crisalad_jax.training.recipes.base import register_recipe
 
 @register_recipe("sift-vlad")
 def sift_vlad(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SIFT with VLAD (Jegou et al., CVPR 2010): 64 words, 8,192 dimensions."""
+    """Make the recipe of SIFT with VLAD (Jegou et al., CVPR 2010): 64 words, 8,192 dimensions."""
     return _words("sift", "vlad", preset)
 
 
 @register_recipe("sift-bow")
 def sift_bow(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SIFT with a bag of 1,000 words by tf-idf (Sivic and Zisserman, ICCV 2003)."""
+    """Make the recipe of SIFT with a tf-idf bag of 1,000 words (Sivic and Zisserman, ICCV 2003)."""
     return _words("sift", "bow", preset)
 
 
 @register_recipe("orb-bow")
 def orb_bow(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make ORB with a bag of 1,000 binary words (Galvez-Lopez and Tardos, T-RO 2012)."""
+    """Make the recipe of ORB with 1,000 binary words (Galvez-Lopez and Tardos, T-RO 2012)."""
     return _words("orb", "bow", preset)
 
 
 def _words(backbone: str, aggregator: str, preset: str) -> TrainConfig:
-    """Make a recipe that keeps photographs' sizes up to a longer side of 640, for any preset."""
+    """Make a recipe, for any preset, that shrinks images to a longer side of at most 640."""
     unit = 1 / 255
     model = ModelConfig(
         image_size=(480, 640),

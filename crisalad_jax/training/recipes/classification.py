@@ -23,7 +23,7 @@ _VIEWPOINTS = LargeMarginCosineConfig(
 
 
 def _classified(model: ModelConfig, loss: LargeMarginCosineConfig, **fields: Any) -> TrainConfig:
-    """Make what both methods share: Adam at 1e-5, and 32 classes with one image of each."""
+    """Make the recipe that both methods share: Adam at 1e-5, 32 classes with one image of each."""
     return TrainConfig(
         model=model,
         loss=LossConfig(kind=loss),
@@ -61,8 +61,8 @@ def _over_resnet(
 def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
     """Make CosPlace's recipe, from gmberton/CosPlace: its defaults, ResNet-18 and 512 dimensions.
 
-    Classes are cells of position and heading: they need the headings of `northdeg`, and many images
-    of a spot, as in San Francisco XL. Images are described at their native sizes.
+    Classes are cells of position and heading: they need headings (column `northdeg`), and many
+    images of a spot, as in San Francisco XL. Images are described at their native sizes.
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(kind="cells", steps=10_000))
     return _over_resnet(model, preset, loss, "float32", min_images=10, epochs=50)

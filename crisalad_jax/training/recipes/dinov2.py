@@ -53,7 +53,7 @@ _HALF_FLOATS: dict[str, Any] = {
     "pixels": "floats",
     "round_to_patch": True,
 }
-"""How several methods' code computes and prepares images."""
+"""Precision and image preparation in the code of several methods."""
 
 
 def _vit(model: ModelConfig, *, adapter: Adapter | str = "none", **fields: Any) -> Any:

@@ -1,4 +1,4 @@
-"""NetVLAD and Patch-NetVLAD over VGG-16, of Nanne/pytorch-NetVlad and QVPR/Patch-NetVLAD."""
+"""NetVLAD and Patch-NetVLAD over VGG-16, from Nanne/pytorch-NetVlad and QVPR/Patch-NetVLAD."""
 
 import dataclasses
 from typing import Any
@@ -13,7 +13,7 @@ from crisalad_jax.training.recipes.base import model_of, register_recipe
 from crisalad_jax.training.schedules import MilestonesSchedule, StepSchedule
 
 MARGIN = 0.1**0.5
-"""The code's margin of 0.1 is for squared distances; its root is that of Euclidean ones."""
+"""The code's margin of 0.1 is for squared distances; its square root is for Euclidean ones."""
 _SGD = OptimiserConfig(
     kind="sgd", learning_rate=1e-4, schedule=StepSchedule(epochs=5), weight_decay=1e-3
 )
@@ -28,9 +28,9 @@ def _model(model: ModelConfig, preset: str, **head: Any) -> ModelConfig:
 def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     """Make NetVLAD's recipe, from Nanne/pytorch-NetVlad: tuples mined in pitts30k_train.mat.
 
-    VGG-16 trains its last stage. A batch is 4 tuples of 12 images. Every 1,000 queries all images
-    are described again, and each query takes the 10 hardest of 1,000 random negatives and its
-    previous ones, if they violate the margin.
+    The last stage of VGG-16 trains. A batch is 4 tuples of 12 images. Every 1,000 queries all
+    images are described again, and each query takes the 10 hardest of 1,000 random negatives and
+    its previous ones, if they violate the margin.
 
     Its schedule steps before an epoch, not after it: the first four epochs have the full learning
     rate. It stops after more than 10 epochs without gain. It draws a round's queries from a fixed
@@ -62,7 +62,7 @@ def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
 
     The code draws queries with replacement, those at night or sideways more often; here each is
     used in turn. It leaves out candidates near any query of a round; here, those near the tuple's
-    own. Its test for violations compares inner products with a sign that nearly every query passes;
+    own query. With its sign of inner products, nearly every query passes its test for violations;
     here every one does. Patch re-ranking learns nothing; `crisalad pca` fits the whitening.
     """
     return dataclasses.replace(

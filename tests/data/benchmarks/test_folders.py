@@ -38,7 +38,7 @@ def test_a_table_of_matches(hall, header):
         (LINES + "q1.jpg,b.png\n", r"line 5: found 'q1.jpg','b.png', expected .* and database/"),
         (LINES + "q1.jpg\n", "line 5: found 1 fields, expected 2"),
         (LINES + "deep/q3.jpg,a.jpg\n", "found 1 of 3 queries .* first is deep/q3.jpg"),
-        ("q1.jpg,a.jpg\n", r"found 2 of 3 queries without .* \('deep/q3.jpg,' has no match"),
+        ("q1.jpg,a.jpg\n", r"found 2 of 3 queries without .* 'deep/q3.jpg,' means no match"),
         ("", "line 1: found , expected query,database"),
         ("database,query\n" + LINES, "line 1: found 'database'"),
     ],

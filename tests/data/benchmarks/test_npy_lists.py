@@ -131,7 +131,7 @@ def test_a_folder_of_several_sets(tmp_path):
         ({"gt": ragged([0], ["x"], [1])}, "a_gt.npy: row 1: found values of type str"),
         ({"qIdx": np.array([0, 3, 1])}, "a_qIdx.npy: found queries .0, 3, 1.*, expected some"),
         ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found queries .*0, 0, 1"),
-        ({"dbImages": np.arange(5)}, "a_dbImages.npy: found an array of .*, expected names"),
+        ({"dbImages": np.arange(5)}, "a_dbImages.npy: found int64 of shape .*, expected names"),
         ({"dbImages": np.empty(0, "<U3")}, "a_dbImages.npy: (found|cannot)"),
         ({"qImages": [*QUERIES[:2], "000/none.jpg"]}, "found 1 of 3 images missing.*none.jpg"),
     ],

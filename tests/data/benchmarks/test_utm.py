@@ -125,7 +125,7 @@ def test_places_without_coordinates(tmp_path, count, name):
     write_sides(tmp_path / "any" / "images" / "test", names, names)
     benchmark = read_utm(tmp_path / "any")
     assert benchmark.name == (f"{name} (@UTM placeholders 1 km apart: a place matches itself only)")
-    assert (f"by {count} places it is {name}" in benchmark.rule) == (count in (607, 1231))
+    assert (f"by its {count} places as {name}" in benchmark.rule) == (count in (607, 1231))
     for path, positives in zip(benchmark.queries, benchmark.ground_truth(), strict=True):
         assert [benchmark.database[i].name for i in positives] == [path.name]
     assert benchmark.database_positions is None
@@ -157,6 +157,6 @@ def write_msls(root: Path, notes: list[str]) -> Path:
 def test_msls_of_the_downloader_is_told_by_its_notes(tmp_path, notes, name):
     benchmark = read_utm(write_msls(tmp_path / "any", notes))
     assert benchmark.name.startswith(name)
-    assert ("by the notes in the names it is MSLS" in benchmark.rule) == name.startswith("MSLS")
+    assert ("by the notes in the names as MSLS" in benchmark.rule) == name.startswith("MSLS")
     assert lists_of(benchmark.positives) == [[i] for i in range(len(notes))]
     assert benchmark.database_positions is not None

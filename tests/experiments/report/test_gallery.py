@@ -139,7 +139,7 @@ def test_a_picture_of_a_map_that_is_gone_is_a_grey_box_and_a_note(photographs, t
     """The first of two answers; it is found where --map-images says."""
     answers = _answers(photographs, [[4, 1]])
     photographs["database"][4].rename(tmp_path / photographs["database"][4].name)
-    words = r"1 picture shown as a grey box, as of .*4\.png: found no such .*; --map-images"
+    words = r"1 picture shown as a grey box \(first: .*4\.png: found no such .*\); --map-images"
     with pytest.warns(Note, match=words):
         picture = drawn(report.show_retrievals(answers), tmp_path)
     grey, there = is_colour(picture, (196, 196, 196)), _is_level(picture, 1)

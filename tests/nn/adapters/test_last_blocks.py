@@ -176,5 +176,5 @@ def test_dynamic_power_equals_torchs() -> None:
 
 
 def test_prompts_are_of_all_blocks() -> None:
-    with pytest.raises(cj.InputError, match=r"adapter: found .*, expected one of all blocks"):
+    with pytest.raises(cj.InputError, match=r"adapter: found .*, expected one in all blocks"):
         backbone(late(cj.make_part("adapter", "prompts")))

@@ -164,14 +164,14 @@ def test_vlad_buff_starts_from_principal_components() -> None:
     np.testing.assert_array_equal(plain.conv.weight, netvlad.conv.weight)
     np.testing.assert_array_equal(whole.centroid_features(jnp.asarray(features)), features)
 
-    words = "features: found 2 of width 6, expected at least 3 of each"
+    words = "features: found 2 of width 6, expected at least 3 features and dimensions"
     with pytest.raises(InputError, match=words):
         config.centroid_features(jnp.asarray(features[:2]))
 
 
 def test_a_start_from_features_that_are_all_alike_is_refused() -> None:
     features = jnp.tile(unit(PATCHES[0, 0]), (5, 1))
-    with pytest.raises(InputError, match="found 5 that are as near to two of 2 centroids"):
+    with pytest.raises(InputError, match="found 5 equally near two of 2 centroids"):
         scores_from_centroids(features[:2], features)
 
 

@@ -144,7 +144,7 @@ def test_a_start_that_is_nan_is_refused(name: str) -> None:
         (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "found to sum to 5 and 6, expected the same"),
         (0.0, MU, NU, 1e-300, "epsilon found 1e-300, expected at least"),
         (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected at least"),
-        (1e10, MU, NU, 1e-35, "scores overflow, expected numbers that float32 can hold"),
+        (1e10, MU, NU, 1e-35, "scores overflow, expected quotients in float32's range"),
         (0.0, MU, NU + 3e-4, 1.0, "found to sum to 6 and 6.0018, expected the same"),
         (0.0, jnp.stack([MU, MU - 1]), NU, 1.0, "found to sum to 2.20728 and 6, expected the same"),
     ],

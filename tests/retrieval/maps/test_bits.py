@@ -119,7 +119,7 @@ def test_bits_and_numbers_in_one_map_are_refused(town_bits, town_map, params, si
         dataclasses.replace(BITS, store="milvus:x.db")
     odd = dataclasses.replace(MODEL.aggregator, token_dim=17)
     config = dataclasses.replace(MODEL, aggregator=odd, cross_image="none")
-    with pytest.raises(InputError, match="dtype: found 49 numbers, expected a mul"):
+    with pytest.raises(InputError, match="dtype: found 49 dimensions, expected a mul"):
         index(
             Model(random_params(config), config),
             sides[0],

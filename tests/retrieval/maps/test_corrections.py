@@ -298,7 +298,7 @@ def test_a_calibration_of_other_images_is_noted(folder):
     move_images(folder, Positions(("x", "y"), {"1.jpg": (1.0, 2.0)}))
     Map.open(folder).close()  # without a note: warnings are errors
     remove_images(folder, ["2.jpg"])
-    with pytest.warns(Note, match="changed .* since its least similarity was measured .2020-01-01"):
+    with pytest.warns(Note, match="changed .* since its minimum similarity was measured .2020-01"):
         Map.open(folder).close()
     Map.open(folder, calibrated=False).close()
 
@@ -439,7 +439,7 @@ def in_x(names_: list[str]) -> Positions:
             "of model 1111.*, expected 0000",
         ),
         (lambda m: reseal(m / "map.json", pca="1" * 64), "components"),
-        (lambda m: reseal(m / "map.json", dtype="float16"), "found other bytes than of float16"),
+        (lambda m: reseal(m / "map.json", dtype="float16"), "found bytes other than float16"),
         (
             lambda m: made(m, {"3.jpg": 4}),
             r"other: found '3\.jpg', which is another image in .*map, expected other names",
@@ -620,7 +620,7 @@ def test_one_other_byte_in_a_record_of_a_change_is_refused(changed, name):
         (lambda m: reseal(m / CHANGE, changed=1), f"{CHANGE}: not a whole record of a change: Typ"),
         (
             lambda m: reseal(m / "segments/0000000008.0000000002.json", names=["0.jpg"]),
-            "0000000008.0000000002.json: not a whole record of images: a name is there twice",
+            "0000000008.0000000002.json: not a whole record of images: a name occurs twice",
         ),
     ],
 )

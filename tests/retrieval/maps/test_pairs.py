@@ -180,7 +180,7 @@ def test_unreadable_images_have_no_pairs(town_map, params, tmp_path, sides):
         ({"within": float("nan")}, "within: found nan, expected more than 0"),
         ({"within": 5}, "within: found no positions in"),
         ({"k": 0, "overlap": 1, "min_gap": 5}, "min gap: found without similar images"),
-        ({"min_gap": 5}, r"min gap: found '0000.jpg', which says no time \(3 such of 3\)"),
+        ({"min_gap": 5}, r"min gap: found '0000.jpg' without a time \(3 such of 3\)"),
         ({"min_similarity": 2}, "min_similarity: found similarity 2"),
         ({"images": "/images", "overlap": 1}, "overlap and within: found with other images"),
         ({"root": "/elsewhere"}, "root: found /elsewhere, expected a folder that holds"),

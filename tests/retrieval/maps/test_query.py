@@ -247,7 +247,7 @@ def test_one_picture_and_what_comes_live_are_asked_of_some_images(town_map, answ
     assert [answer.image for answer in live.ranked] == expected
     for options, words in (
         ({"where": "folder=nowhere"}, "where: found none of 7 images"),
-        ({"where": where, "sequence": BayesFilter()}, "with a sequence, expected one of both"),
+        ({"where": where, "sequence": BayesFilter()}, "with a sequence, expected only one"),
     ):
         with pytest.raises(InputError, match=words):
             query(places, answers.queries, **options)

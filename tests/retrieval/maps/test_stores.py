@@ -169,7 +169,7 @@ def test_a_damaged_file_is_found_when_the_map_is_opened(tmp_path, spoil):
     spoilt = spoil(path.read_bytes())
     assert spoilt != path.read_bytes()
     path.write_bytes(spoilt)
-    words = r"0000000000\.npy: found other bytes than of float32 \(3, 24\), expected the whole"
+    words = r"0000000000\.npy: found bytes other than float32 \(3, 24\), expected the whole"
     with pytest.raises(InputError, match=words):
         store.check([(0, 3)])
 

@@ -108,7 +108,7 @@ def reranking(name: str, top: int) -> Reranking:
 def test_windows_of_any_length_are_refused(name: str) -> None:
     """Their inner products would not tell which is the nearest."""
     kept = dataclasses.replace(NETVLAD, projection=ProjectionConfig(dim=24, renormalise=False))
-    with pytest.raises(InputError, match=r"^rerank: found a model whose projection leaves lengths"):
+    with pytest.raises(InputError, match=r"^rerank: found a model whose descriptors are not unit"):
         Reranking(name, 2).check(kept)
     Reranking(name, 2).check(NETVLAD)
 

@@ -49,7 +49,7 @@ def test_where_a_token_comes_from(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("token", ["", "short", f"{TOKEN} {TOKEN}", f"{TOKEN}é"])
 def test_a_token_that_is_easy_to_guess(token):
-    with pytest.raises(InputError, match=f"token: found {len(token)} letters"):
+    with pytest.raises(InputError, match=f"token: found {len(token)} characters"):
         serve_map("no.map", token=token)
 
 

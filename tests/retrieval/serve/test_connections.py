@@ -46,7 +46,7 @@ def test_more_connections_than_there_may_be(service, half, monkeypatch):
         held[-1].setblocking(False)
         with pytest.raises(BlockingIOError):
             held[-1].recv(1)
-    assert said[0] == "found more than 2 connections at once: those that wait longest are ended"
+    assert said[0] == "found more than 2 connections at once: closing those that wait longest"
 
 
 @pytest.mark.parametrize("half", HALVES)

@@ -217,7 +217,7 @@ def test_a_request_may_be_of_some_images(service, pictures):
         ("POST", "/locate?k=x", b"", 400, "k: found 'x'"),
         ("POST", "/locate", bytes(LIMIT + 1), 413, f"found more than {LIMIT} bytes"),
         ("POST", "/locate", iter([bytes(LIMIT)] * 2), 413, f"found more than {LIMIT} bytes"),
-        ("POST", "/images?name=a.jpg", b"", 403, "a map that is only read"),
+        ("POST", "/images?name=a.jpg", b"", 403, "a read-only map"),
         ("GET", "/locate", None, 405, "method not allowed"),
         ("GET", "/images/7", None, 404, "number: found 7, expected 0 to 6"),
         ("GET", "/images/-1", None, 404, "number: found -1"),
