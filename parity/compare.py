@@ -91,7 +91,7 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         "gradients, kinks": Tolerance(
             7e-1,
             "a ReLU whose input rounds to the other side of 0 switches a path on one side only: "
-            "0.68 is measured (seed 0: 0.36), and beside it up to 0.24 between torch's own "
+            "0.68 is measured (seed 0: 0.36), and up to 0.24 between torch's own "
             "gradients and float64's at seed 0; a gradient of 0 would be 1 off",
         ),
         STEP: Tolerance(7e-5, "as in float32: parameters and gradients are float32"),
@@ -107,7 +107,7 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         ),
         AFTER: Tolerance(
             1e-1,
-            "all elements: a sign that differs is a step of 2e-2, beside weights of some 4e-2; "
+            "all elements: a sign that differs is a step of 2e-2, with weights of some 4e-2; "
             "three times the measured 3.2e-2 (seed 0: 2.5e-2)",
         ),
         "losses": Tolerance(

@@ -34,7 +34,7 @@ from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.output import Note
 from tests.attack.world import PRODUCTS, ROOT, Attack, Bench, Row, carry_out, part_of
 
-PROMISE = "refused with one line, or told of; never silent"
+PROMISE = "refused with one line, or reported; never silent"
 
 
 @functools.cache

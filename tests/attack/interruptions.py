@@ -290,12 +290,14 @@ def attack_closed_output(bench: Bench, _: float) -> list[Row]:
 def attack_training(bench: Bench, scale: float) -> list[Row]:
     """Interrupt training twice, signal it while another process asks for its folder, and nohup."""
     verb = Verb(bench, "train")
-    twice = Row("Ctrl-C twice in training", "it ends at once, and the same command finishes alike")
+    twice = Row(
+        "Ctrl-C twice in training", "it ends at once, and the same command finishes identically"
+    )
     waiting = Row(
         "a signal while a second process wants the same run",
-        "the second is refused in one line, the first saves, the same command finishes alike",
+        "the second is refused in one line, the first saves, the same command finishes identically",
     )
-    ignored = Row("SIGHUP under nohup", "it goes on, and finishes alike")
+    ignored = Row("SIGHUP under nohup", "it continues, and finishes identically")
     for turn in range(part_of(5, scale)):
         out = bench.folder / "twice" / f"{turn}"
         pause = bench.random.choice([0.0, 0.001, 0.01, 0.1])

@@ -410,7 +410,7 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
         "kills of training, chains", "killed runs end with the bits of an uninterrupted run"
     )
     of_kills = {
-        name: Row(f"kills of training: {name}", "the same command goes on")
+        name: Row(f"kills of training: {name}", "the same command resumes")
         for name in ("a program as it starts", "a state is written", *TRAINING.names)
     }
     most = -(-kills // chains)

@@ -131,7 +131,7 @@ def attack_processes(bench: Bench, scale: float) -> list[Row]:
     )
     of_ends = Row(
         "kills of one of four processes: the rest in four, two or one",
-        "the losses and weights of one process left alone, within 1e-4",
+        "the losses and weights of one undisturbed process, within 1e-4",
     )
     whole, out = bench.folder / "whole", bench.folder / "run"
 

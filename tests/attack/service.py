@@ -305,7 +305,7 @@ def attack_pictures(bench: Bench, scale: float) -> list[Row]:
         f"answered, or 400 within {LIMIT:g} s; in less than {MEMORY:,} MB beyond the start",
     )
     beside = Row(
-        "served pictures that take long: a question beside 12 of each kind",
+        "served pictures that take long: a query with 12 of each kind",
         f"it is answered within {3 * LIMIT:g} s",
     )
     names = [name for name, (status, _) in BOMBS.items() if scale >= 1 or status == 400]
