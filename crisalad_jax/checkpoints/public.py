@@ -240,7 +240,7 @@ def convert(
 
     Args:
         source: a file that `read_checkpoint` reads.
-        target: the file to write: .safetensors for a public source, else a public checkpoint.
+        target: file to write: .safetensors for a public source or `half`, else a public checkpoint.
         format: public format of the target (`FORMATS`), for a source of this package; by default
             one that can hold the model.
         backbone: the backbone's checkpoint, for a source that is only an AnyLoc vocabulary.

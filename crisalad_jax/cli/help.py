@@ -41,7 +41,7 @@ def class_of(name: str, module: Any, arguments: Sequence[str]) -> type:
 
 
 def flags_parser(kind: type, program: str) -> argparse.ArgumentParser:
-    """Make the parser of a command's class, whose actions describe its flags."""
+    """Make a command's argparse parser, whose actions describe the command's flags."""
     import tyro
 
     with warnings.catch_warnings():

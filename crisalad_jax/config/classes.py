@@ -33,7 +33,7 @@ class ClassesConfig:
     """Width of a sector of headings in degrees, CosPlace's alpha."""
     spacing: PositiveInt = 5
     """Distance in cells between neighbouring classes of a group, CosPlace's N; EigenPlaces' is 3.
-    Places of a group are over N - 1 cells apart, or not `Places.near` each other."""
+    Places of a group are not `Places.near` each other; if that is None, over N - 1 cells apart."""
     sector_spacing: PositiveInt = 2
     """Distance in sectors between neighbouring classes of a group, CosPlace's L."""
     focal_distance: PositiveFloat = 10.0

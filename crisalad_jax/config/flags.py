@@ -37,7 +37,7 @@ def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "")
         path: dotted name of this configuration's own flag.
 
     Raises:
-        InputError: no such part.
+        InputError: the arguments name an unknown part.
     """
     fields: list[tuple[str, Any, Any]] = []
     if isinstance(config, Part):

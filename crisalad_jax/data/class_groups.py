@@ -26,7 +26,7 @@ _ONE_SPOT = 1e-3
 
 
 class Views(NamedTuple):
-    """City, position and heading of every image, in metres of one UTM zone per city."""
+    """City, heading and position of every image, the latter in metres in one UTM zone per city."""
 
     city: Int32[np.ndarray, " images"]
     east: Float64[np.ndarray, " images"]

@@ -39,7 +39,7 @@ class Track(NamedTuple):
     """Seconds since 1970, ascending."""
     points: Float64[np.ndarray, "point 2"]
     start_time: float | None = None
-    """When a video of the images began, in seconds since 1970; None if unknown."""
+    """Start of the video that the images come from, in seconds since 1970; None if unknown."""
     time_offset: float = 0.0
     """Seconds that are added to the times of images."""
 

@@ -60,8 +60,8 @@ def evaluate(
 ) -> list[GroupingResult]:
     r"""Measure Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
 
-    Whether two images of one side show the same place is decided by the benchmark's positions, or
-    without positions by its ground truth (`evaluation.leakage`).
+    Whether two queries or two database images show the same place is decided by the benchmark's
+    positions, or without positions by its ground truth (`evaluation.leakage`).
 
     A model without a cross-image encoder has one grouping, `any`: its descriptors do not depend on
     the batch. The tokens of all images are held in memory, and the descriptors of one grouping and
@@ -91,10 +91,10 @@ def evaluate(
 
     Raises:
         InputError: parameters of another configuration; bits of a length that is not a multiple of
-            8; no ground truth; an image cannot be read, or none of a side can; components that are
-            not for this model or give no unit vectors; a precision out of range; a published
-            grouping whose batches are not known for this set; or what `Grouping.parse`,
-            `Reranking.check` and `Reranking.stage` raise.
+            8; no ground truth; an unreadable image, or no readable query or database image;
+            components that are not for this model or give no unit vectors; a precision out of
+            range; a published grouping whose batches are not known for this set; or what
+            `Grouping.parse`, `Reranking.check` and `Reranking.stage` raise.
 
     Example:
         >>> import jax, shutil

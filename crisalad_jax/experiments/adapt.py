@@ -50,8 +50,8 @@ class Adapted(NamedTuple):
 
     steps: int
     held_out: tuple[float, float]
-    """Recall of held-out frames by `TrainConfig.monitor`, before and after. These queries are
-    not the copies that stopped the training."""
+    """`TrainConfig.monitor` before and after, for augmented copies of held-out frames; other
+    copies decide when training stops."""
     others: dict[str, tuple[float, Difference]]
     """Recall@1 of each watched set before, and its change."""
     weights: pathlib.Path | None

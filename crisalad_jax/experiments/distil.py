@@ -65,7 +65,7 @@ def distil(
         out: folder of the run; see `fit`.
         weights: the student's weights to start from, or a published model's name.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
-        validation_images: folder of the images that a .mat file or .npy lists in `validation` name.
+        validation_images: folder of the images, if a .mat file or .npy in `validation` lists them.
         fps: frames per second taken from videos and logs.
         topic: the topic of images in a log.
         reading: how images are read.
@@ -77,9 +77,9 @@ def distil(
         How the run ended.
 
     Raises:
-        InputError: both or neither of `images` and `data`; a loss without a teacher, or with labels
-            but single images; a student with a cross-image encoder; too few images; what
-            `open_sources`, `read_places`, `extract`, `open_benchmark` and `fit` raise.
+        InputError: both or neither of `images` and `data`; a loss without a teacher; `labels`
+            without `data` or with one image a place; a student with a cross-image encoder; too few
+            images; what `open_sources`, `read_places`, `extract`, `open_benchmark` and `fit` raise.
         Interrupted: the same call resumes.
 
     Example:

@@ -149,7 +149,7 @@ class ModelConfig:
         """Height and width of the network's input: `image_size`, rounded if `preprocessing` does.
 
         Training, exports and costs use this size, whatever `PreprocessingConfig.size_rule` is. For
-        local features, it is the height and width of their bytes.
+        local features, it is `Backbone.encoded_size`.
         """
         return self.backbone.encoded_size or self.rounded_size(self.image_size)
 

@@ -255,7 +255,7 @@ def describe(
     key: Key[Array, ""] | None = None,
     micro_batch: int | None = None,
 ) -> Float[Array, "image descriptor"]:
-    """Compute the descriptors of a batch of RGB images, as unit vectors.
+    """Compute the descriptors of a batch of RGB images.
 
     With a cross-image encoder, a descriptor depends on the images that `mask` lets it attend to:
     `mask[i, j]` allows image i to attend to image j, and None allows all. An image that may attend

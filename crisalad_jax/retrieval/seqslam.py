@@ -34,9 +34,9 @@ class SeqSlam:
 
     The difference between a frame and an image, one minus their similarity, is enhanced: the mean
     over the surrounding images is subtracted, and the result is divided by their deviation. The
-    score of an image is the smallest sum of enhanced differences along a line that ends at it with
+    score of an image is the smallest sum of enhanced differences along a line that ends at it in
     the last frame. Lines have velocities from `slowest` to `fastest` in steps of 0.1 images of the
-    map per frame, and are rounded to the nearest image; they stop at the first image. The share of
+    map per frame, and are rounded to the nearest image; they stop at the first image. The belief in
     an image is the softmax of its negative score, which the paper does not have. The paper also
     compares not by cosine, but by sums of absolute differences of small, patch-normalised images
     (the model `thumbnail`).

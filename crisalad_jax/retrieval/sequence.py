@@ -47,8 +47,8 @@ class BayesFilter:
 
     Motion: the camera moves along the map in either direction, at most `reach` times as fast as the
     camera of the map did. All images within reach are equally likely, and the next image is always
-    within reach; with probability `jump` the camera may be anywhere. By default, a frame counts as
-    an image of the map; if times or distances are known, `reach` is in seconds of the map per
+    within reach; with probability `jump` the camera may be anywhere. By default, `reach` is in
+    images of the map per frame; if times or distances are known, it is in seconds of the map per
     second, or metres per metre. Evidence: the likelihood of an image is exp(`sharpness` * z), where
     z is its similarity to the frame in standard deviations from the mean over the map, so it does
     not depend on how close together the similarities of a model are.
@@ -62,7 +62,7 @@ class BayesFilter:
     Args:
         reach: the largest motion of the camera: images of the map per frame, seconds per second, or
             metres per metre.
-        jump: probability that a frame is anywhere, above 0 and below 1.
+        jump: probability that the camera jumps to any image, above 0 and below 1.
         sharpness: weight of a frame relative to the frames before it.
         adapt: whether to subtract the mean of each side.
 
@@ -175,7 +175,7 @@ class BayesFilter:
             similarities: similarities of every frame, in order, to every image of the map.
             common: as in `start`.
             along: as in `start`.
-            moved: motion to every frame, as in `step`; None is one frame each.
+            moved: motion before each frame, as in `step`; None is one frame each.
 
         Returns:
             The best place at each frame, given that frame and those before it.

@@ -163,7 +163,7 @@ class TrainConfig:
     optimiser: OptimiserConfig = OptimiserConfig(
         schedule=LinearSchedule(end_fraction=0.2, decay_steps=4000)
     )
-    """By default the paper's AdamW, with a decay "as adopted in SALAD": to 0.2 in 4,000 steps."""
+    """By default the paper's AdamW, with a decay "as adopted in SALAD": by 80 % in 4,000 steps."""
     trainable: str = ADAPTERS_AND_HEAD
     """What trains, comma-separated: adapters,head (the paper); last-N-blocks,norm,head (SALAD);
     all; or patterns of names, as in adapters,head,backbone.blocks.1[01]. A leading - freezes a word

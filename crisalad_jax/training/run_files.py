@@ -299,7 +299,7 @@ def write_data(
 
 
 def checksum_of_places(places: TrainingSet) -> int:
-    """Compute the CRC of the names of all images and places, or of the queries' positives."""
+    """Compute the CRC of all images' names and places; in a `QuerySet`, also of its positives."""
     if isinstance(places, Mapping):
         return checksum(map(checksum_of_places, sets_of(places)))
     if isinstance(places, QuerySet):

@@ -115,7 +115,7 @@ def read_bytes(path: str | os.PathLike[str], expected: str, *, largest: int = LA
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:
-    """Read a UTF-8 text file of at most `LARGEST_TEXT` bytes, without a byte order mark.
+    """Read a UTF-8 text file of at most `LARGEST_TEXT` bytes; drop a byte order mark.
 
     Raises:
         InputError: what `read_bytes` raises, or the bytes are not UTF-8.

@@ -58,8 +58,8 @@ class Sampler(Part, abc.ABC):
     describes: ClassVar[bool] = False
     """Whether it uses descriptors, which the current model computes when an epoch begins."""
     regroups: ClassVar[bool] = False
-    """Whether it makes its own places: a group may mix images of several of the set's places, some
-    of which may have few images."""
+    """Whether it groups images anew: a group serves as a place, and may mix images of several of
+    the set's places, also of those with few images."""
 
     def check(self, places: Places) -> None:
         """Raise InputError if it cannot draw from these places; by default never."""
@@ -83,7 +83,7 @@ class Sampler(Part, abc.ABC):
         Returns:
             Places in an order, in which consecutive ones make a batch, or the images of every
             batch. An order may omit a place, or repeat it with other images. A place that is
-            `Places.near` another of its batch moves to the next.
+            `Places.near` another of its batch moves to a later batch.
         """
 
 

@@ -73,7 +73,7 @@ class ComparisonConfig:
     A name that is not a method's adds its own line, whatever model the file holds, and may end in +
     and a second stage, as in fol-large+fol."""
     backbone: str | None = None
-    """Backbone that training starts from; None trains from random weights, as in `scratch`."""
+    """Backbone that training starts from; None is random weights, as in the recipe `scratch`."""
     preset: str = "b14"
     epochs: PositiveInt | None = None
     """Number of epochs; None is the recipe's, or `EPOCHS` from random weights."""
@@ -116,12 +116,12 @@ class ComparisonConfig:
 
     @property
     def flag(self) -> str:
-        """Flag that names the lines."""
+        """Command-line flag that selects the lines."""
         return "--methods" if self.kind == "compare" else "--rows"
 
     @property
     def is_papers(self) -> bool:
-        """Whether the rows are those of the paper's Table 2, which Table 3 belongs to."""
+        """Whether the rows are those of the paper's Table 2; Table 3 is then measured too."""
         return self.kind == "ablate" and not self.rows
 
     @property

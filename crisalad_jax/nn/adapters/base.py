@@ -63,7 +63,7 @@ class Adapter(Part, abc.ABC):
     """
 
     last = None  # not annotated, so that a subclass can make it a field
-    """Number of final blocks that have an adapter and its parameters; None means all."""
+    """Number of final blocks that have the adapter; None means all."""
     paths = 1  # not annotated either
     """Number of side paths of an adapter with a `side_path`. Above 1, `init` returns a tuple of the
     parameters of each path, and `FeatureSpec.path` selects the one that runs."""
@@ -150,7 +150,7 @@ class Adapter(Part, abc.ABC):
     def side_path(
         self, params: Any, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, Any]:
-        """Return a side path's tokens after a block; after the last block they are the output.
+        """Return a side path's tokens after a block; the backbone outputs those after the last.
 
         The path starts from the tokens that enter the first block with an adapter.
 

@@ -83,7 +83,7 @@ class Aggregator(Part, abc.ABC):
         """Return the shape of an image's tokens for features of width `dim`."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Return the features to request from a backbone of `depth` blocks; by default the last.
+        """Return features to request from a backbone of this depth; by default the last block's.
 
         Raises:
             InputError: the backbone has too few blocks.

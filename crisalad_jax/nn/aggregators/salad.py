@@ -125,7 +125,7 @@ class SaladConfig(Aggregator):
         return TokenShape(self.token_dim, self.clusters, self.cluster_dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Salad:
-        """Draw parameters as the public code does: torch's default linears, dustbin score 1."""
+        """Draw parameters as the public code does: linears as in torch, a dustbin score of 1."""
         token_key, cluster_key, score_key = random_init.split(key, 3)
         dim, hidden = backbone.dim, self.hidden
         below = {name: tau for name, tau in self._taus.items() if tau < 1}

@@ -40,7 +40,7 @@ class Features(NamedTuple):
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class FeatureSpec:
-    """The features that an aggregator requests; by default those after the last layer."""
+    """The features that an aggregator requests; by default those after the last block."""
 
     levels: tuple[int, ...] | None = None
     """Blocks, counted from 1 in ascending order, whose output patches are concatenated. None takes
@@ -66,7 +66,7 @@ class FeatureSpec:
         """Return the levels in a backbone of `depth` blocks.
 
         Raises:
-            InputError: the levels are out of order or above `depth`, or a facet has several.
+            InputError: levels out of order or above `depth`, or several for a facet of attention.
         """
         levels = (depth,) if self.levels is None else self.levels
         in_order = list(levels) == sorted(set(levels)) and 0 < levels[0] <= levels[-1] <= depth

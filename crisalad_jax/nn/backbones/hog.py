@@ -23,8 +23,8 @@ class HogConfig(WholeImageBackbone):
 
     Sobel gradients of the grey image vote, by unsigned angle, linearly for the two nearest of 9
     bins. Cells have 8 x 8 pixels. Blocks of 2 x 2 cells, one cell apart, are divided by their L2
-    norms. Without gradients, all dimensions are equal. There are no parameters: the class token is
-    the descriptor. Preprocessing needs bytes, mean 0 and deviation 1/255.
+    norms. Without gradients, all entries are equal. There are no parameters, and the descriptor is
+    the class token. Preprocessing must leave pixels at 0 to 255: mean 0 and deviation 1/255.
     """
 
     dim: int = _DIM

@@ -21,9 +21,9 @@ _LEAST = 0.5
 class ThumbnailConfig(WholeImageBackbone):
     """SeqSLAM's images of 32 x 64 grey pixels (Milford and Wyeth, ICRA 2012).
 
-    Each patch of 8 x 8 is normalised by its mean and deviation. If all are uniform, all dimensions
-    are equal. There are no parameters: the class token is the descriptor. Preprocessing needs
-    bytes, mean 0 and deviation 1/255.
+    Each patch of 8 x 8 is normalised by its mean and deviation. If all are uniform, all entries
+    of the descriptor are equal. There are no parameters, and the descriptor is the class token.
+    Preprocessing must leave pixels at 0 to 255: mean 0 and deviation 1/255.
     """
 
     dim: int = _DIM

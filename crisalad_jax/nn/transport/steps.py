@@ -185,7 +185,7 @@ class NewtonStep(Step):
     entropic: ClassVar[bool] = True
 
     def init(self, problem: Problem, params: Any) -> Float[Array, "*batch"]:
-        """Return a temperature of 1; the first step finds the one for its potentials."""
+        """Return a temperature of 1, which the first step replaces to suit the potentials."""
         return 0 * problem.log_mu[..., 0] + 1
 
     def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:

@@ -75,7 +75,8 @@ def check_positions(
         zone: the map's UTM zone.
 
     Raises:
-        InputError: the map has no positions or, for degrees, metres without a known UTM zone.
+        InputError: the map has no positions, or the file needs degrees and the map's UTM zone is
+            unknown.
     """
     suffix = _suffix(path)
     if suffix not in POSITION_SUFFIXES:

@@ -159,7 +159,7 @@ class Images(Sequence[MapImage]):
 
     @property
     def starts(self) -> list[int]:
-        """Number of the first image of each part, followed by the number of images."""
+        """Index of the first image of each part and, at the end, the count of all images."""
         return self.removed.numbers_of(np.append(self._firsts.values, self.rows)).tolist()
 
     def part_of(self, number: int) -> Part:

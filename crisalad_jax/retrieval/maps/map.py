@@ -133,7 +133,7 @@ class Map:
     ) -> Self:
         """Open a map to search it as it is now; images appended later are not seen.
 
-        An approximate search of fewer or other images is not used, and a warning says so.
+        An approximate search built for another set of images is not used, and a warning says so.
 
         Args:
             folder: a folder that `index` made.
@@ -296,9 +296,9 @@ class Map:
     ) -> Neighbours:
         """Find the k most similar images for each query, best first; all if there are fewer.
 
-        Search is exact, by inner product, or by equal bits in a map of bits; among equal
-        similarities the earlier image comes first. A map with an approximate search finds nearly
-        all of them. Their similarities are exact.
+        Search is by inner product, or by equal bits in a map of bits; among equal similarities the
+        earlier image comes first. An approximate search, if the map has one, finds nearly all of
+        the k most similar; their similarities are exact.
 
         Args:
             queries: unit descriptors of the map's model, shortened by its `components`. A map of
@@ -341,7 +341,7 @@ class Map:
 
     @property
     def stale_search(self) -> str | None:
-        """Kind of an approximate search of fewer or other images, which is not used; or None."""
+        """Kind of an approximate search not used, as it is for another set of images; or None."""
         return stale_kind(self.folder, self._segments.spans) if self._approximate is None else None
 
     def shorten(self, descriptors: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n short"]:

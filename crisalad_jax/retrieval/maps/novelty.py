@@ -52,7 +52,7 @@ class Novelty:
     def choose(
         self, names: Sequence[str], descriptors: Float32[np.ndarray, "n d"]
     ) -> Bool[np.ndarray, " n"]:
-        """Return which of the next described images of the source are new."""
+        """Return which of the next images differ enough from the last selected one."""
         rows = self._map.as_stored(descriptors)
         return np.array([self._is_new(*each) for each in zip(names, rows, strict=True)], bool)
 

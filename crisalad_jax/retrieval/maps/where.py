@@ -38,16 +38,16 @@ class Where:
     """
 
     folder: str = ""
-    """Folder, video, or log and its topic, that contains the image, at any depth; with * at the
-    end, a prefix of the name. Empty is any."""
+    """What contains the image, at any depth: a folder, a video, or a log with its topic. With * at
+    the end, a prefix of the image's name. An empty string matches all images."""
     added: Interval = ALWAYS
     """When the image was added to the map, as its record says."""
     time: Interval = ALWAYS
     """When the image was taken, if its name says so in seconds since 1970, as names of log frames
     do. Images without such a time meet only the default."""
     box: tuple[float, float, float, float] | None = None
-    """West, south, east and north of the position, ends included, in the map's axes: degrees or
-    metres. In degrees, west may exceed east: a box across the antimeridian (RFC 7946, 5.2)."""
+    """Bounds of the position, inclusive: west, south, east and north, in the map's axes (degrees or
+    metres). In degrees, west may exceed east: a box across the antimeridian (RFC 7946, 5.2)."""
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -58,7 +58,7 @@ class Where:
 
         Args:
             text: such as "folder=monday, added>=2026-05-01, time<2026-05-01T12:00,
-                box=11.5,48.1,11.6,48.2", any of which may be omitted; times may be given twice.
+                box=11.5,48.1,11.6,48.2", any of which may be omitted; times may have two bounds.
 
         Raises:
             InputError: another key, a missing or second value, or one that is not a time or a box.

@@ -14,7 +14,7 @@ from crisalad_jax.retrieval.verification.verify import Verifier, order_by_inlier
 class LocalReranker(SecondStage):
     """Re-ranks the first neighbours of each query by similarity and inliers.
 
-    The numbers of inliers replace the similarities.
+    In the result, numbers of inliers take the place of similarities.
     """
 
     def __init__(

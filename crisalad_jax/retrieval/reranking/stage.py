@@ -269,7 +269,7 @@ class Reranker(SecondStage):
                 bar.advance(len(rows))
 
     def compare(self, query: int, candidates: Sequence[int]) -> Iterator[float | list[float]]:
-        """Yield the score of a query with each candidate, or one for each part."""
+        """Yield the score of a query with each candidate, or a list if the method has several."""
         patches, dim = self._queries.features.shape[1:]
         step = max(1, min(_AT_ONCE, self._top, _NUMBERS // (patches * dim)))
         given = (self._params,) if self._method.by_params else ()
@@ -283,6 +283,6 @@ class Reranker(SecondStage):
             yield from np.asarray(found)[: len(part)].tolist()
 
     def order(self, scores: np.ndarray, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Order candidates only by their scores, fused if there are several."""
+        """Order candidates by their scores, fused if each has several; ignore similarities."""
         fused = self._method.fuse(scores, self._config).astype(np.float32)
         return np.argsort(-fused, kind="stable"), fused

@@ -22,7 +22,7 @@ class Tiles:
 
     @property
     def origin(self) -> str:
-        """Scheme, host and port, which the page's policy allows."""
+        """Scheme, host and port, which the page's content security policy allows."""
         return self.url[: self.url.index("/", len("https://"))]
 
 

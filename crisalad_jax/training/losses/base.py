@@ -102,7 +102,7 @@ class Loss(Part, abc.ABC):
     """Learning rate of the loss's own parameters, which have their own Adam optimiser."""
 
     grouping: ClassVar[ClassesConfig | None] = None
-    """Grouping of images into classes; None for a loss of pairs of places."""
+    """Grouping of images into classes; None for a loss of pairs of images."""
     reads_tokens: ClassVar[Literal["local", "dense"] | None] = None
     """Field of `Tokens` that the loss also compares: the aggregator's local tokens, or local
     features, which few aggregators provide in training."""
