@@ -119,8 +119,8 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
     """Check that a model can be exported in this way, before tracing it.
 
     Raises:
-        InputError: parameters of another configuration; 2 GiB or more of weights inside; optimal
-            transport that raises unless converged; float inputs with local-contrast normalisation;
+        InputError: parameters of another configuration; 2 GiB or more of weights inside the
+            program; optimal transport that raises unless converged; float inputs with local-contrast normalisation;
             normalisation other than ImageNet's for COLMAP; or a compute type other than float32 in
             a format other than StableHLO.
     """
@@ -240,7 +240,7 @@ def write_export(
         model: parameters and configuration.
         how: format, platforms, batch size and grouping.
         calibration: prepared images from which onnxruntime calibrates int8 products, for ONNX and
-            OpenVINO. The manifest records how far descriptors then differ. None is float32.
+            OpenVINO. The manifest records how far descriptors then differ. None keeps float32.
 
     Returns:
         The content of manifest.json.

@@ -293,13 +293,13 @@ def convert(
 def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) -> Any:
     """Read the backbone of any checkpoint, for a model with the backbone `config`.
 
-    Adapters are read if the file has the same kind and sizes; otherwise they are those of `fresh`.
-    If a ResNet has more stages, the first ones are used.
+    Adapters are read if the file's have the same kind and sizes; otherwise `fresh` provides them.
+    If the file's ResNet has more stages, the first ones are used.
 
     Args:
         path: a file that `read_checkpoint` reads.
         config: configuration of the model's backbone.
-        fresh: parameters of such a backbone, whose adapters are used if the file has none.
+        fresh: parameters of such a backbone, whose adapters replace missing or different ones.
 
     Returns:
         The backbone's parameters.

@@ -60,7 +60,7 @@ class Registry(Generic[P]):
                 defaults.
 
         Raises:
-            InputError: when decorating: the name is taken, or the part is not of this kind.
+            InputError: a name with ':' or ','; when decorating, a taken name or unfit part.
         """
         where = f"register_{self.kind}"
         require(

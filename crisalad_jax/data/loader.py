@@ -269,7 +269,7 @@ def training_batches(
         augmentation: changes each image; a registered augmentation, or its name.
         seed: seed of all random draws, together with the epoch and the step.
         epoch: index of the epoch, from 0.
-        preprocessing: how images are resized; always to `image_size`, antialiased, as bytes.
+        preprocessing: how to resize, but always to `image_size`, antialiased, as bytes.
         steps: number of batches; None takes what the sampler draws: every place about once.
         start_step: the first batch to yield, to resume an interrupted epoch.
         part: (i, n) yields the i-th of n equal parts of every batch, for the i-th of n processes.

@@ -129,7 +129,7 @@ def read_places(
             source of images (`open_source`).
         cities: names of CSV files without the suffix, or of MSLS's folders; None reads all, or for
             MSLS those of its training set.
-        min_images: minimum number of images; a warning counts places with fewer.
+        min_images: minimum images per place; a warning counts places left out.
         place_radius: radius of a place in metres. In the order of the images, one that is farther
             than this from all centres becomes a centre; then each image joins the place with the
             nearest centre. Centres in a batch are more than four radii apart.

@@ -59,11 +59,11 @@ def read_query_set(
         on_bad_image: see `open_benchmark`.
 
     Returns:
-        The queries with at least one positive.
+        The set, without queries lacking positives.
 
     Raises:
         InputError: what `open_benchmark` raises; the set has neither positions nor ground truth, or
-            no query has a positive.
+            no query has positives and negatives.
 
     Example:
         >>> import shutil

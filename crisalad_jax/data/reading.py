@@ -31,7 +31,7 @@ def image_batches(
         image_size: height and width in pixels that images are resized to, or from which the size
             rule of `preprocessing` computes the size.
         batch_size: number of images in a batch.
-        preprocessing: how images are resized and, if float, normalised.
+        preprocessing: how images are resized and, for "floats", normalised.
         side_multiple: sides are rounded to multiples of this number of pixels.
         check_size: function that raises InputError for a height and width to refuse.
         on_bad_image: "stop" at an unreadable image, or "skip" it.

@@ -33,8 +33,8 @@ def resize_image(
     "bicubic" on bytes. (OpenCV's INTER_AREA is a box filter, several times further from Pillow on
     photographs; its INTER_LINEAR aliases.) Floats equal torch's `interpolate` up to rounding, with
     or without antialiasing.
-    The first few images are resized by numpy, as are all images if numba (the `train` extra) is
-    not installed: the result is bit-identical, but takes ten times as long.
+    Numpy resizes the first few images, for which loading numba (the `train` extra) does not pay,
+    and all without it: the result is bit-identical, but takes ten times as long.
 
     Args:
         image: 8-bit RGB; with "floats" also float32.
@@ -50,7 +50,7 @@ def resize_image(
         The image at that size, of uint8 or float32.
 
     Raises:
-        InputError: the image is not 8-bit RGB, either size has no pixels, or an unknown filter.
+        InputError: another type or shape of image, a side without pixels, or an unknown option.
 
     Example:
         >>> import numpy as np

@@ -101,7 +101,7 @@ def read_track(
         path: the file. A .gpx has track points with times. A .geojson or .json has lines with
             `coordTimes` or `times`, or points with `time`. A table has the columns time and
             lat,lon or east,north or x,y, or other usual names of these.
-        start_time: when a video of the images began, with the zone: "2026-05-01T12:00:00+02:00".
+        start_time: when the images' video began, with the zone: "2026-05-01T12:00:00+02:00".
         time_offset: seconds that are added to the times of images, for cameras whose clock is wrong
             or shows local time: -7200 if it is two hours ahead of UTC.
 
@@ -110,7 +110,8 @@ def read_track(
 
     Raises:
         InputError: the file cannot be read; it has no points, points without times, times that go
-            back, or positions out of range; or a start or offset that is not a time.
+            back, or positions out of range; a start that is no time with a zone, or an infinite
+            offset.
 
     Example:
         >>> text = "time,lat,lon\\n2026-05-01T10:00:00Z,52.2,21.0\\n2026-05-01T10:00:10Z,52.3,21.0"

@@ -94,8 +94,8 @@ def operating_point(
         precision: share of accepted first retrievals that must be correct, above 0 and at most 1.
 
     Returns:
-        The lowest such similarity, rounded down as far as it accepts the same queries; if no
-        similarity reaches the precision, the one with the highest precision.
+        The lowest such similarity, rounded down to the fewest decimals that accept the same
+        queries; if none reaches the precision, the one with the highest precision.
 
     Raises:
         InputError: a precision out of range, a NaN similarity, or what `right_retrievals` raises.

@@ -66,8 +66,8 @@ def publish(
         The folder, or the address of the repository's page.
 
     Raises:
-        InputError: the run has no weights; a file is missing or damaged; the folder or the
-            repository has files; an invalid licence name; or what `upload_folder` raises.
+        InputError: the run has no weights; a file is missing or damaged; the folder is not
+            empty; an invalid licence name; or what `upload_folder` raises.
         ModuleNotFoundError: huggingface_hub is not installed, and `to` is on the hub.
 
     Example:

@@ -263,16 +263,16 @@ def check_unit_length(model: ModelConfig, name: str) -> None:
 
 
 def with_aggregator(model: ModelConfig, name: str, preset: str, **changes: Any) -> ModelConfig:
-    """Return a model with the aggregator of this name, at the size of the preset.
+    """Return a model's configuration with another aggregator, at the size of a preset.
 
     Args:
-        model: the model.
+        model: the configuration.
         name: a registered aggregator.
         preset: preset of the aggregator's size.
         **changes: other fields of the model.
 
     Returns:
-        The changed model.
+        The changed configuration.
 
     Raises:
         InputError: no such aggregator, or it does not fit the model.

@@ -318,7 +318,7 @@ def extract_tokens(
         images: see `describe`.
         config: see `describe`.
         key: see `describe`.
-        micro_batch: a divisor of the batch; None is the whole batch.
+        micro_batch: a divisor of the number of images; None takes all.
 
     Returns:
         The tokens of each image.
@@ -739,7 +739,8 @@ def describe_training_batch(
         measured: images that batch norms take their statistics from; None uses the stored ones.
         key: random key for dropout; None means no dropout.
         micro_batch: see `extract_tokens`.
-        sub_batches: sizes of groups of consecutive images that attend to each other; empty for one.
+        sub_batches: sizes of groups of consecutive images that attend to each other; empty if the
+            whole batch is one group.
 
     Returns:
         (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them. The
@@ -791,7 +792,7 @@ def transport_masses(
 
 
 def self_mask(count: Any) -> Bool[Array, "image image"]:
-    """Return the mask that lets every image attend only to itself, whatever its batch.
+    """Return the mask that lets every image attend only to itself, not its batch.
 
     Args:
         count: number of images in the batch, which may be symbolic in an export.

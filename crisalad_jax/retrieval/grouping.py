@@ -101,7 +101,7 @@ def parse_groupings(texts: Iterable[str]) -> list[Grouping]:
 
 
 class Batches(NamedTuple):
-    """All images of a side in batches, and which descriptors to take from each batch."""
+    """All queries or all database images in batches, and which descriptors to take from each."""
 
     images: Int64[np.ndarray, "batch place"]
     """Indices of the images of each batch; a padding place repeats one of them."""

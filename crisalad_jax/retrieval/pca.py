@@ -165,15 +165,15 @@ def fit_pca(
 
     The d x d covariance is summed in float64, some rows at a time, and its leading eigenvectors are
     computed. If there are fewer descriptors than d, their n x n Gram matrix gives the same
-    components. All descriptors are read twice, first for their mean.
+    components. Fitted descriptors are read twice, first for the mean.
 
     Args:
-        descriptors: n descriptors, as `retrieval.search` takes them, of any length.
+        descriptors: n x d, as for `search`, of any norm.
         dim: number of components.
         config: whether to whiten, and whether to normalise.
         samples: fit at most this many descriptors, drawn at random; None for all.
         seed: random seed of the draw.
-        model: the `model_hash` of the model that made the descriptors; other models are refused.
+        model: `model_hash` of the model that made the descriptors; others cannot use the result.
         name: name of the descriptors in messages, such as their file.
         quiet: whether to hide the progress bar.
 

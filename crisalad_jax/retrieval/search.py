@@ -61,7 +61,7 @@ def search(
             a .npy file stores as two untyped bytes, "V2"), or in another type that is converted to
             float32; or bits from `pack_bits`.
         queries: unit descriptors of the q queries, or their bits.
-        k: number of neighbours per query, at most n.
+        k: neighbours per query, or all n if fewer.
         chunk: database rows compared at a time, rounded up to a multiple of the device count.
         quiet: whether to hide the progress bar.
 
@@ -70,7 +70,7 @@ def search(
 
     Raises:
         InputError: an array that is empty, not a matrix, or has a row that is not finite or not of
-            unit length; descriptors of different lengths; bits on only one side; k or chunk below
+            unit norm; descriptors of different lengths; bits on only one side; k or chunk below
             1.
 
     Example:

@@ -44,7 +44,7 @@ DEPTH = 11.0
 
 
 def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> None:
-    """Add a building from u = 0 to `width`."""
+    """Add a building to a front, from u = 0 to `width`; axes as in `Mesh.front`."""
     wall, trim = pick(rng, habit.walls), pick(rng, _TRIMS)
     floors = max(1, habit.floors + int(rng.integers(-2, 3)))
     ground = rng.uniform(3.2, 4.8)

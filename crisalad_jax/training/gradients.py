@@ -59,7 +59,7 @@ def gradient_norms(
 
     Raises:
         InputError: what `init_train_state` and the step of `make_train_step` raise; or the loss
-            classifies, because its classes belong to a run.
+            classifies, because only a run knows its classes.
 
     Example:
         >>> import jax, numpy as np

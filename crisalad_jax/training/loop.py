@@ -119,14 +119,14 @@ def fit(
             resumes it.
         quiet: whether to hide the progress bar.
         targets: a teacher's unit descriptor of each image of `places`, possibly a memory map, for a
-            loss that learns from them; an image with zeros is left out.
+            loss that learns from them; all-zero rows leave their images out.
 
     Returns:
         The final parameters, and how the run ended.
 
     Raises:
         InputError: nothing in the model trains; an argument is out of range; the validation has no
-            ground truth; `out` holds something else, or a run of another configuration or start; an
+            ground truth; `out` holds other files, or a run with other settings, data or weights; an
             image cannot be read; there are too few places, classes or images; the loss is no longer
             finite (the state before that step is saved); a file cannot be written; or another
             process of the run is lost (this one then ends without waiting for the others).

@@ -177,8 +177,8 @@ def init_train_state(
         (state, frozen). The state is a copy, so `params` can still be used.
 
     Raises:
-        InputError: what `split_params` raises; no parameter would train, as with AnyLoc, whose
-            vocabulary fits one backbone; or the loss needs a key, or classes.
+        InputError: what `split_params` raises; no parameter would train, or the aggregator cannot
+            (AnyLoc's); or the loss lacks a key or classes.
 
     Example:
         >>> import jax

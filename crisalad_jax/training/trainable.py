@@ -65,7 +65,7 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
     If only some parameters of the blocks train, the stack of blocks is cut; `merge_params` joins
     it. No gradient is then computed in frozen blocks before the first trainable one, nor, if only a
     part of that block trains, for its input. Batch-norm statistics have no gradient and count as
-    frozen, though a step may update them. So does an aggregator that learns nothing (AnyLoc's).
+    frozen, though a step may update them. Aggregators that learn nothing (AnyLoc's) count so too.
 
     Args:
         params: the whole model.
@@ -210,7 +210,7 @@ def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Cris
         config: the model's configuration.
 
     Returns:
-        The whole model, with one stack of blocks.
+        The whole model, with its blocks joined again.
 
     Raises:
         InputError: parameters of another model.

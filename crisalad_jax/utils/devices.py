@@ -119,8 +119,8 @@ def parts_for_caches(images: int, at_once: int) -> int:
 
     Args:
         images: number of images, which may be spread over devices as `devices_for` chooses them.
-        at_once: number of images that a device computes at once, or the next smaller one that
-            divides its share; at least one.
+        at_once: maximum number of images that a device computes at once; lowered to a divisor of
+            the device's share.
     """
     if not images or target().platform != "cpu":
         return 1

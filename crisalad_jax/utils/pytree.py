@@ -17,10 +17,10 @@ _T = TypeVar("_T")
 def pytree_dataclass(cls: type[_T]) -> type[_T]:
     """Make a class a frozen dataclass and register it as a pytree whose children are its fields.
 
-    Unflattening bypasses `__init__`. JAX also builds trees of shapes, labels or masks from the same
-    structure, which must not be checked against the annotations of arrays.
+    Unflattening bypasses `__init__`, because JAX also builds trees of shapes, labels or masks from
+    the same structure, which must not be checked against the annotations of arrays.
 
-    `repr` shows names, types and shapes, but no values (`summary`), unless the class has its own.
+    `repr` shows names, types and shapes, but no values (`summary`), unless overridden.
 
     Args:
         cls: a class with annotated fields.

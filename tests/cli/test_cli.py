@@ -485,7 +485,8 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public, we
     )
     words = ("--backbone: found beside --weights",)
     fails(capfd, *arguments, "--weights", weights, words=words)
-    words = (f"{public}: this backbone is another", "backbone.depth: found 2, expected 3")
+    differs = f"{public}: this backbone differs from the model's"
+    words = (differs, "backbone.depth: found 2, expected 3")
     fails(capfd, *arguments, "--model.backbone.depth", 3, words=words)
     assert not (tmp_path / "run").exists()
     succeeds(capfd, *arguments)

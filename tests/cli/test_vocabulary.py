@@ -68,7 +68,7 @@ def test_bad_input_is_one_line(capfd, shared, tmp_path):
             (out, "--preset", "tiny", "--aggregator", "netvlad", "--facet", "key"),
             "--facet: found with --aggregator netvlad, which has no such setting, expected one",
         ),
-        ((out, "--preset", "tiny", "--backbone", weights), "this backbone is another than the mod"),
+        ((out, "--preset", "tiny", "--backbone", weights), "this backbone differs from the model"),
     ):
         fails(capfd, *start, *more, words=(words,))
     assert not out.exists()

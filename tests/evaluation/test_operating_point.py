@@ -93,7 +93,7 @@ def test_how_many_answers_a_precision_takes():
 def test_two_answers_are_a_coincidence():
     """Two of two show 0.05 ** (1 / 2), 22 %."""
     two = OperatingPoint(0.99, 0.5, 2, 2, 40, 0, 0)
-    with pytest.raises(InputError, match=r"found 2 answers .* on town, 2 right, .* least 22\.4 %"):
+    with pytest.raises(InputError, match=r"found 2 .* on town, 2 correct, .* least 22\.4 %"):
         check_supported(two, "town")
     check_supported(two._replace(answered=3), "town")
 
@@ -121,7 +121,7 @@ def test_points_are_of_the_curve_and_accept_the_same_queries(seed):
 
 @pytest.mark.parametrize("precision", [0, -0.5, 1.01, float("nan")])
 def test_such_a_precision_is_refused(precision, params, benchmark):
-    words = rf"precision: found {precision}, expected a fraction above 0 and at most 1"
+    words = rf"precision: found {precision}, expected a fraction above 0, at most 1"
     with pytest.raises(InputError, match=words):
         point_at(precision)
     # Before any image is read.

@@ -211,7 +211,7 @@ def test_files_of_something_else_are_named(places, indexes, tmp_path):
     path = tmp_path / "some.index"
     faiss.write_index(faiss.IndexFlatL2(4), str(path))
     with pytest.raises(
-        InputError, match=r"some\.index: found a IndexFlatL2, expected one of inner"
+        InputError, match=r"some\.index: found a IndexFlatL2, expected an index by inner product"
     ):
         load_index(path)
     save_index(path, indexes["ivf-rabitq"])

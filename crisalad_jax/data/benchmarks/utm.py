@@ -50,7 +50,7 @@ def read_utm(
     they are those on the ground.
 
     VPR-datasets-downloader writes placeholder coordinates for Nordland (easting 0, frames
-    25 / 10.5 m apart), SPED and AmsterTime (easting 0, places 1 km apart). The benchmark's name
+    a few metres apart), SPED and AmsterTime (easting 0, places 1 km apart). The benchmark's name
     and rule then say what they stand for. MSLS is recognised by the notes in the file names.
 
     Args:

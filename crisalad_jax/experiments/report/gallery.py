@@ -62,8 +62,8 @@ def show_retrievals(
     Args:
         found: answers of `query`, or one of the results of `evaluate`.
         benchmark: the evaluated benchmark, for a result.
-        queries: indices of the queries to show, in this order. None takes half of them correct and
-            half wrong if that is known, evenly spaced, not at random.
+        queries: indices of the queries to show, in this order. None takes evenly spaced ones, half
+            of them correct and half wrong if that is known.
         rows: maximum number of queries shown if `queries` is None.
         columns: maximum number of retrievals shown for each.
         root: folder of a map's images; None is the original one. A missing image is a grey box,

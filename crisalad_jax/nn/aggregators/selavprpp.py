@@ -105,7 +105,7 @@ def init_head(key: PRNGKeyArray, dim: int, width: int) -> SelaVprPp:
 
 
 def head(params: SelaVprPp, patches: Patches) -> Float[Array, "*batch width"]:
-    """Apply a linear layer, the generalised mean of unit patches and a linear layer.
+    """Apply a linear layer, the generalised mean over its outputs at unit length, and another.
 
     The result is at least float32, and not normalised.
     """

@@ -214,7 +214,7 @@ class VladBuffConfig(VladConfig):
         return VladBuff(reduction, conv, centroids, jnp.asarray(BURST))
 
     def sums(self, params: VladBuff, patches: Patches) -> Float[Array, "*batch cluster reduced"]:
-        """Reduce patches, and sum their residuals weighted by shares / burst weights."""
+        """Reduce patches, and sum their residuals, weighted by share divided by burst weight."""
         if params.reduction is not None:
             patches = l2_normalise(reduce_features(params.reduction, patches))
         weighed = shares(params.conv, patches) / burst_weights(params.burst, patches)[..., None]

@@ -122,7 +122,7 @@ def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
 
 
 def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
-    """Return the kind of an outdated approximate search, of fewer or other images; else None."""
+    """Return the kind of an approximate search that is outdated; None if none is."""
     found = _indices(folder)
     if not found or _current(folder, additions) is not None:
         return None

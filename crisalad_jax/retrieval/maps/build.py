@@ -133,8 +133,8 @@ def index(
     The same call resumes after a kill.
 
     Args:
-        model: a model from `load`, or a `Runtime`. The image size and types of an existing map take
-            precedence.
+        model: a model from `load`, or a `Runtime`, with the image size and compute dtype of an
+            existing map.
         images: a folder, searched with its subfolders, or another source of images
             (docs/how-to/image-sources.md); the map names images by their paths in it.
         out: the map's folder.
@@ -144,8 +144,8 @@ def index(
         position_topic: the topic of positions in a log; see `open_source`.
         positions: where images were taken, or a table or track of positions (`read_track`). None
             takes them from `images`, if that is a table or a robot log; else from @UTM names; else
-            from the EXIF data of JPEGs. Names of several UTM zones give degrees, or metres of the
-            map's zone.
+            from the EXIF data of JPEGs. Names in several UTM zones become degrees, or metres in
+            the map's zone.
         every_metres: minimum distance from the last selected image of the same folder or video;
             nearer images are left out, those without a position are not. None takes all.
         novelty: maximum cosine similarity to the last selected image of the same folder or video;
@@ -155,9 +155,9 @@ def index(
             searched by Hamming distance. None is the existing map's, or "float32" for a new map.
         pca: components that shorten the descriptors, or a file of them; the map stores a copy. None
             is the existing map's, or none for a new map.
-        search: the approximate search to build from the map's descriptors, or to extend by new
-            ones, see `Map.build_search`; "exact" removes one. None leaves an existing one
-            unchanged, which is not used once the map has grown.
+        search: the approximate search to build, or to extend by new descriptors; see
+            `Map.build_search`. "exact" removes an existing one. None leaves it unchanged, and once
+            the map has grown it is no longer used.
         again: whether to add removed images again (`remove_images`).
         reading: how images are read.
         cluster: the Ray cluster that describes the images, as in `extract`; None is this process.

@@ -188,8 +188,8 @@ def replace_images(
         What was replaced; `unmatched` are images that the map does not have.
 
     Raises:
-        InputError: another model; no image whose name is in the map; an image that cannot be read,
-            or none that can; or what `open_for_appending` raises.
+        InputError: another model; no image whose name is in the map; an unreadable image under
+            "stop", or only such images; or what `open_for_appending` raises.
 
     Example:
         >>> import cv2, jax
@@ -308,13 +308,12 @@ def merge_maps(
 ) -> MapChange:
     """Merge maps of the same model and settings into a map, which is created if it is missing.
 
-    A new map gets the images of the others except removed ones. Images keep their folders and
-    dates.
+    Removed images, of the others or of the map, stay out. The rest keep their folders and dates.
 
     Args:
         folder: the map's folder.
         others: the folders of the maps whose images are appended.
-        store: "files", or "milvus:URI", which also stores float16 maps as float32. None is the
+        store: "files", or "milvus:URI", where float16 descriptors become float32. None is the
             existing map's, or "files" for a new map.
         quiet: whether to hide the progress bar.
 

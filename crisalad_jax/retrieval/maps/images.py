@@ -61,7 +61,7 @@ class Part(NamedTuple):
     """Properties that images appended together share."""
 
     added: str | None
-    """The time; None if their record has none."""
+    """When the images were added, as text; None if their record has no time."""
     root: str
     first: int
     """Their first row."""

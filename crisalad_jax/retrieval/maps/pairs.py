@@ -89,10 +89,10 @@ def image_pairs(
             describes; None pairs the map's images with each other.
         model: that model; None loads it from its recorded path (`Map.load_model`).
         k: pair each image with its k most similar ones; 0 turns this rule off.
-        min_similarity: minimum similarity of these.
-        min_gap: minimum time in seconds between these, from the times in their names (loop
-            closures). Times in different videos, or by different clocks, are far enough apart.
-        overlap: pair each image of the map with this many next ones of its folder or video.
+        min_similarity: minimum similarity for rule `k`.
+        min_gap: minimum seconds between images for rule `k`, by the times in their names (to find
+            loop closures). Different videos or clocks count as far enough apart.
+        overlap: pair each image of the map with this many that follow in its folder or video.
         within: pair images of the map that were taken at most this many metres apart.
         root: folder that names are relative to; None is that of the images or, if there are
             several, the one that contains them all.
@@ -100,12 +100,12 @@ def image_pairs(
         reading: how `images` are read.
 
     Returns:
-        The pairs, in order of the images; the k most similar best first.
+        The pairs: by `overlap`, then `within`, then `k`, with each image's best first.
 
     Raises:
         InputError: a number out of range; no rule; `overlap` or `within` with `images`; `within`
-            in a map without positions; `min_gap` with a name without a time; a name that a
-            line cannot hold; or what `Map.search` and reading the images raise.
+            in a map without positions; `min_gap` without `k` or times in names; a name with
+            spaces or leading #; or what `Map.search` and reading the images raise.
 
     Example:
         >>> import jax

@@ -153,8 +153,8 @@ def query(
         exact: whether to search exactly even if the map has an approximate search.
         min_similarity: a query is of an unknown place if no image is this similar to it; see
             `Answers.known`. None is the map's calibration or, without one, -1, which accepts all.
-        sequence: a filter over the map's images in order, for queries that are consecutive frames
-            of one camera; None answers every query independently.
+        sequence: how to match consecutive frames of one camera to the map's images in order; None
+            answers every query independently.
         where: which images of the map to search, such as "folder=monday, added>=2026-05-01"
             (`Where.parse`); None is all, which `sequence` requires.
         verify: how to verify the best answers by local features and rank them by their inliers
@@ -165,7 +165,7 @@ def query(
         The answers, which remain usable after the map is closed.
 
     Raises:
-        InputError: another model; no image, one that cannot be read, or none that can; a number
+        InputError: another model; no image, an unreadable one under "stop", or only such; a number
             out of range; or what `Map.search` and `Verifier.check` raise.
 
     Example:

@@ -74,7 +74,7 @@ def serve_map(
 
     Args:
         folder: the map.
-        weights: the model that made it; None is the file that was used then.
+        weights: the file of its model; None is the one that the map records.
         engine: "jax", "onnxruntime" or "openvino"; or "auto", the one that `Map.fastest_engine`
             chooses.
         host: name or address to listen on. Any that others can reach needs a token.

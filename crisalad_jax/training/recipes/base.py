@@ -298,7 +298,7 @@ def with_head(model: ModelConfig, aggregator: Any) -> ModelConfig:
 
 @takes(config=TrainConfig)
 def from_scratch(config: TrainConfig) -> TrainConfig:
-    """Change a recipe so that its model trains from random weights, as in `scratch`.
+    """Change a recipe so that its model trains from random weights, like recipe `scratch`.
 
     The recipe's model and kind of loss stay, because they define its method. The optimiser, the
     loss's constants, the augmentation and the batches are those of `scratch`, in float32. The whole
