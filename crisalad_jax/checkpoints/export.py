@@ -120,9 +120,9 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
 
     Raises:
         InputError: parameters of another configuration; 2 GiB or more of weights inside the
-            program; optimal transport that raises unless converged; float inputs with local-contrast normalisation;
-            normalisation other than ImageNet's for COLMAP; or a compute type other than float32 in
-            a format other than StableHLO.
+            program; optimal transport that raises unless converged; float inputs with
+            local-contrast normalisation; normalisation other than ImageNet's for COLMAP; or a
+            compute type other than float32 in a format other than StableHLO.
     """
     check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))

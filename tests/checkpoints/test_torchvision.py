@@ -73,7 +73,7 @@ def test_training_starts_from_the_first_stages(tmp_path: pathlib.Path) -> None:
     expected = state["layer3.1.conv2.weight"].numpy().transpose(2, 3, 1, 0)
     np.testing.assert_array_equal(last, expected)
     with pytest.raises(
-        InputError, match=r"another than .*: backbone.layers: found 18, expected 50"
+        InputError, match=r"differs from .*: backbone.layers: found 18, expected 50"
     ):
         read_backbone(tmp_path / "resnet18.pth", ResNetConfig(), None)
 

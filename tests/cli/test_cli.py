@@ -483,7 +483,7 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public, we
         *("train", "--config", tmp_path / "recipe.json", "--backbone", public),
         *("--data", shared / "city", "--out", tmp_path / "run", "--quiet"),
     )
-    words = ("--backbone: found beside --weights",)
+    words = ("--backbone: found together with --weights",)
     fails(capfd, *arguments, "--weights", weights, words=words)
     differs = f"{public}: this backbone differs from the model's"
     words = (differs, "backbone.depth: found 2, expected 3")
