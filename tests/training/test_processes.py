@@ -298,7 +298,9 @@ def test_where_one_process_is_killed_the_other_ends_and_both_go_on(
     assert found[killed][0] == -signal.SIGKILL
     code, words = found[1 - killed]
     assert code != 0
-    assert re.search("^crisalad: processes: lost (process [01]|another process)", words, re.MULTILINE)
+    assert re.search(
+        "^crisalad: processes: lost (process [01]|another process)", words, re.MULTILINE
+    )
     assert "Check failure stack trace" not in words
     assert [code for code, _ in ends(start(shared, out))] == [0, 0]
     assert_same_run(out, by_devices / "1")
