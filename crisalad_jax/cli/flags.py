@@ -45,7 +45,7 @@ class JsonFlag(Flags):
     """Flag for JSON output."""
 
     json: Annotated[pathlib.Path | None, Target((".json",))] = None
-    """File for the result as JSON; - prints it."""
+    """File for the result as JSON; - prints it instead."""
 
 
 class TableFlags(JsonFlag):

@@ -16,7 +16,7 @@ from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca, sh
 
 
 class Pca(JsonFlag, QuietFlag):
-    """Fit principal components to descriptors, for shorter ones (extract, evaluate --pca)."""
+    """Fit principal components, by which extract and evaluate --pca shorten descriptors."""
 
     descriptors: pathlib.Path
     """A .npy file, such as `crisalad extract` writes; not of evaluation images."""

@@ -273,7 +273,7 @@ def answer_lines(answers: Answers) -> Iterator[str]:
     """Yield the name of each query, and below it its answers; an unknown place has one line.
 
     Numbers are in columns, and names at the ends of lines: a name that is too long for a terminal
-    continues on its next line, and is copied in one piece.
+    wraps there, and can still be copied in one piece.
     """
     found = list(json_rows(answers))
     position = ", ".join(answers.axes or ("position",))

@@ -648,7 +648,7 @@ def attention_maps(
         The softmax of the scores, in float32 at least.
 
     Raises:
-        InputError: the backbone has no such block, no attention, or adapters on a side path; or
+        InputError: the backbone has no such block or no attention, or it has adapters on a side path;
             what `describe` raises.
 
     Example:

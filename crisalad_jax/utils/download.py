@@ -47,7 +47,7 @@ class _PassingFault(Exception):
 def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False) -> None:
     """Download a file to `target`, which appears only when it is complete.
 
-    The beginning of an unfinished file stays next to it, as `target`.part, with the server's
+    What has arrived of an unfinished download stays in `target`.part, with the server's
     description of it. The next call resumes from there if the server still has the same file: the
     same length, and the same ETag or modification time. If it gives neither, the next call starts
     again.

@@ -46,8 +46,8 @@ def read_utm(
 ) -> Benchmark:
     """Read `@UTM_east@UTM_north@zone@letter@...` images; a positive is at most `radius` m away.
 
-    Distances between images of one zone and hemisphere are those of east and north; between others,
-    they are those on the ground.
+    Distances between images of one zone and hemisphere are in its plane; other distances are on
+    the ground.
 
     VPR-datasets-downloader writes placeholder coordinates for Nordland (easting 0, frames
     a few metres apart), SPED and AmsterTime (easting 0, places 1 km apart). The benchmark's name

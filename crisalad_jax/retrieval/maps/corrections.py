@@ -68,7 +68,7 @@ class MapChange(NamedTuple):
     stay_out: int = 0
     """Number of images that were removed from the map before, and are not merged into it."""
     stale_search: str | None = None
-    """Kind of an approximate search that now lacks images and is not used."""
+    """Kind of the approximate search, if its index lacks images and so is not used."""
 
 
 def find_images(

@@ -192,9 +192,9 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
 def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
     """Make SuperVLAD's recipe, from Lu-Feng/SuperVLAD (NeurIPS 2024), without its encoder.
 
-    The last four blocks train. Scores start from k-means centroids of 5,000 training images. The
-    code uses images of MSLS for these, at 322 x 322. (The encoder of its cross-image model has a
-    separate optimiser, which gets no gradient after the first step.)
+    The last four blocks train. The score layer starts from k-means centroids of 5,000 training
+    images. The code uses images of MSLS for these, at 322 x 322. (The encoder of its cross-image
+    model has a separate optimiser, which gets no gradient after the first step.)
     """
     return TrainConfig(
         model=model_of(
