@@ -648,8 +648,8 @@ def attention_maps(
         The softmax of the scores, in float32 at least.
 
     Raises:
-        InputError: the backbone has no such block or no attention, or has adapters on a side path; what
-            `describe` raises.
+        InputError: the backbone has no such block or no attention, or has adapters on a side path;
+            or what `describe` raises.
 
     Example:
         >>> import jax, numpy as np
