@@ -67,7 +67,7 @@ def test_what_does_not_go_together_is_one_line(folder, queries, tmp_path, capfd)
         (("--verify", 1, "--map-depth", tmp_path), "intrinsics: found none with map_intrinsics"),
         (("--verify", 1, "--matcher", "m.onnx"), "m.onnx"),
         (("--verify", 1, "--matcher", one), f"{one}: onnxruntime cannot load it"),
-        (("--verify", 1, "--intrinsics", "1,1,1,1,9999,10"), "expected the camera's size or its"),
+        (("--verify", 1, "--intrinsics", "1,1,1,1,9999,10"), "expected the camera's size or asp"),
         (("--verify", 1, "--intrinsics", "1,2"), "intrinsics: found '1,2', expected fx,fy,cx,cy"),
     ):
         fails(capfd, *query(folder, one, *given), words=(words,))
