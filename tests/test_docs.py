@@ -142,6 +142,14 @@ def test_a_private_name_would_be_found():
     assert _private(modules) == ["sinkhorn.none"]
 
 
+def test_attacks_are_as_many_as_their_table_has():
+    table = (ROOT / "docs" / "reliability" / "attacks.md").read_text(encoding="utf-8")
+    tries, failures = re.findall(r"\*\*([\d,]+)\*\*", table.splitlines()[-1])
+    page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    assert f"{tries} times" in page
+    assert f"**{tries}** | **{failures}** |" in page
+
+
 def test_readme_is_short():
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 130
 

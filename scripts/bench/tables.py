@@ -159,6 +159,7 @@ def _check_targets(
     """Exit with one line if a study can't be saved in `--out`."""
     try:
         for name in names:
+            assert name in TITLES, f"{name} needs a title"
             for path in files_of(name, arguments.out):
                 check_target(path)
     except (InputError, OSError) as error:

@@ -205,7 +205,6 @@ def test_what_gains_makes_the_map_anew(shared, folder, tmp_path, monkeypatch) ->
     assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "map", "out"]
 
 
-@pytest.mark.slow  # half a minute; what gains is above
 def test_the_map_stays_where_nothing_is_gained_or_others_lose(
     shared, folder, tmp_path, monkeypatch
 ) -> None:

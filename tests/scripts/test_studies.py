@@ -243,8 +243,9 @@ def test_only_the_published_dustbin_is_dead(study: ModuleType) -> None:
 def test_the_page_links_every_table_and_picture(study: ModuleType) -> None:
     page = STUDIES.read_text(encoding="utf-8")
     for name in {*study.STUDIES, "bench_fixed", "bench_converged", "recall"}:
-        assert f"(sinkhorn/{name}.md)" in page
-        assert f"(sinkhorn/{name}.png)" in page
+        for link in (f"sinkhorn/{name}.md", f"sinkhorn/{name}.png"):
+            assert f"({link})" in page
+            assert (PAGE.parent / link).exists()
 
 
 @pytest.mark.parametrize(

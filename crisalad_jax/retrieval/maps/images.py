@@ -269,7 +269,7 @@ class Images(Sequence[MapImage]):
         """
         rows = [*removed, *moved]
         if not all(isinstance(row, int) and 0 <= row < self.rows for row in rows):
-            raise ValueError(f"found rows that are not integers from 0 to {self.rows - 1}")
+            raise ValueError(f"found rows that are not integers from 0 to below {self.rows}")
         if len(moved) != len(positions) or None in positions:
             raise ValueError(f"found {len(positions)} positions, expected {len(moved)}")
         new = copy.copy(self)
