@@ -110,8 +110,7 @@ def read_track(
 
     Raises:
         InputError: the file cannot be read; it has no points, points without times, times that go
-            back, or positions out of range; a start that is no time with a zone, or an infinite
-            offset.
+            back, or positions out of range; a start without a time zone, or an infinite offset.
 
     Example:
         >>> text = "time,lat,lon\\n2026-05-01T10:00:00Z,52.2,21.0\\n2026-05-01T10:00:10Z,52.3,21.0"

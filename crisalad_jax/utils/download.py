@@ -37,7 +37,7 @@ def is_offline() -> bool:
 
 
 class MissingFileError(InputError):
-    """An address at which there is no file."""
+    """No file exists at the address."""
 
 
 class _PassingFault(Exception):

@@ -205,7 +205,7 @@ def main() -> None:
     arguments = read_some(flags("Tabulate claimed recalls.", "docs/claims"), STUDIES)
     for name in arguments.studies:
         leave(name, STUDIES[name](), arguments)
-    if "claims" in arguments.studies and arguments.out.resolve() == FOLDER:
+    if "claims" in arguments.studies and arguments.out.resolve() == FOLDER.resolve():
         start, end = "<!-- best -->\n", "<!-- end of best -->"
         before, rest = README.read_text(encoding="utf-8").split(start)
         with atomic_path(README) as temporary:

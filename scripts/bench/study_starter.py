@@ -6,6 +6,7 @@ Images are described independently. Intervals are 95 % bootstrap intervals.
 """
 
 import pathlib
+import sys
 from collections.abc import Iterator, Mapping
 
 import jax
@@ -59,7 +60,10 @@ def main() -> None:
     models["**starter**"] = own, config
     sets = [open_benchmark(path) for path in given.data]
     heads = "set", "descriptor", "queries", *(f"R@{k}" for k in KS)
-    found = list(rows(models, sets))
+    found = []
+    for each in rows(models, sets):
+        found.append(each)
+        print(*each, sep="  ", file=sys.stderr, flush=True)
     leave("recalls", Study(Table(heads, found, "Recall in percent.", 2), found), given)
 
 

@@ -58,8 +58,8 @@ class Sampler(Part, abc.ABC):
     describes: ClassVar[bool] = False
     """Whether it uses descriptors, which the current model computes when an epoch begins."""
     regroups: ClassVar[bool] = False
-    """Whether it groups images anew: a group serves as a place, and may mix images of several of
-    the set's places, also of those with few images."""
+    """Whether it regroups images: a group serves as a place, and may mix images of several of the
+    set's places, also of those with few images."""
 
     def check(self, places: Places) -> None:
         """Raise InputError if it cannot draw from these places; by default never."""
