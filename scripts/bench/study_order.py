@@ -15,13 +15,13 @@ import pathlib
 import statistics
 from typing import Any
 
-from study_small import Arm, named, open_asked, paired, small_vit, trained, with_encoder
+from study_small import WORLD, Arm, named, open_asked, paired, small_vit, trained, with_encoder
 from tables import Study, Table, flags, leave, read
 
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.cross_image import SageCrossImageConfig
-from crisalad_jax.synthetic import WorldConfig, write_world
+from crisalad_jax.synthetic import write_world
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.utils.progress import progress_bar
 
@@ -37,7 +37,7 @@ def with_sage(config: TrainConfig) -> TrainConfig:
 
 
 def arms() -> list[Arm]:
-    without, world = small_vit(), WorldConfig()
+    without, world = small_vit(), WORLD
     return [
         Arm("none", without, world),
         Arm("CriSALAD's", with_encoder(without), world),
@@ -52,7 +52,7 @@ def groupings() -> list[str]:
 
 def ask(arm: Arm, seed: int, runs: pathlib.Path) -> dict[str, dict[int, float]]:
     """Evaluate a trained arm, and return its recalls in percent by grouping and K."""
-    asked = open_asked(runs / "worlds" / named(WorldConfig()) / "test")
+    asked = open_asked(runs / "worlds" / named(WORLD) / "test")
     model = trained(arm, seed, runs)
     names = groupings() if model.config.cross_image.attends else ["single"]
     results = evaluate(model, asked.data, groupings=names, reading=Reading(quiet=True))
@@ -94,7 +94,7 @@ def main() -> None:
     parser.add_argument("--runs", type=pathlib.Path, required=True, help="folder for the trainings")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     arguments = read(parser, "order")
-    write_world(arguments.runs / "worlds" / named(WorldConfig()), WorldConfig())
+    write_world(arguments.runs / "worlds" / named(WORLD), WORLD)
     results: dict[str, list[dict[str, dict[int, float]]]] = {}
     total = len(arms()) * len(arguments.seeds)
     with progress_bar("trainings", total, "runs", quiet=False) as bar:
