@@ -1,7 +1,7 @@
 """CriSALAD visual place recognition in pure JAX.
 
-The public names are listed once, in `__init__.pyi`, and imported when they are first used, so that
-reading images does not import jax, and a model does not import file formats.
+The public names are listed in `__init__.pyi` and imported on first use, so that reading images
+does not import jax, and making a model does not import the code for checkpoint formats.
 """
 
 import os

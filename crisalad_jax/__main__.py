@@ -10,7 +10,7 @@ from crisalad_jax.utils.signals import end_at_signals
 
 
 def main() -> None:
-    """Run the command that the arguments name, and exit with its code."""
+    """Run the command that `sys.argv` names, and exit the process with the command's exit code."""
     end_at_signals()
     keep_on_without_reader()
     # Imported after signals are handled, because it takes a while.
@@ -27,10 +27,10 @@ def main() -> None:
 
 
 def keep_on_without_reader() -> None:
-    """Let the program continue when the reader of its output is gone, as after `| head`.
+    """Let the program continue when the reader of its output has exited, as `| head` does.
 
-    A full disk raises an `InputError` once, at the write or flush that meets it; for standard error
-    it raises none, and the program continues. Characters that the encoding lacks are escaped.
+    Later output is dropped. A full disk raises `InputError` once, at the first failing write to
+    standard output; on standard error it is ignored. Characters the encoding lacks are escaped.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)

@@ -1,11 +1,11 @@
 """Entropic optimal transport for aggregation: the public API of `crisalad_jax.nn.transport`.
 
 The problem is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo and Civera, CVPR
-2024) took from SuperGlue (Sarlin et al., CVPR 2020). Arrays are laid out (..., N, K): N rows
+2024) took from SuperGlue (Sarlin et al., CVPR 2020). Arrays have shape (..., N, K): N rows
 (patches), K columns (clusters, and the dustbin last), which runs faster than the published (K, N).
-`docs/sinkhorn.md` says when to use which variant, and gives the equations.
+`docs/sinkhorn.md` has the equations, and says when to use which variant.
 
-Register a custom step, dustbin, gradient or start like the built-in ones:
+Register a custom step (iteration), dustbin, gradient or start (initial potentials) as follows:
 
     @register_step("capacity")
     def capacity(problem, potentials):

@@ -1,1 +1,1 @@
-"""Model files: weights, states of a run, public checkpoints and exported programs."""
+"""Model files: weights, resumable training states, public checkpoints and exported programs."""

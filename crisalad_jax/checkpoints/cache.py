@@ -1,7 +1,7 @@
 """The cache of published models: each is downloaded once, checked, and stored as a weight file.
 
-A model has a folder in `user_cache() / "models"`, with the published file, the weight file that was
-made from it, and a record of the published file's SHA-256 at its first download.
+The folder of a model, `user_cache() / "models" / NAME`, holds the published file, the weight file
+that was converted from it, and a record with the published file's SHA-256 at the first download.
 """
 
 import contextlib
@@ -26,34 +26,34 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.version import VERSION
 
 MIRROR = "CRISALAD_MIRROR"
-"""Environment variable: address of a mirror, which is tried before the published addresses."""
+"""Environment variable with the base URL of a mirror, tried before a file's published address."""
 _RECORD = "record.json"
 """Name of the record of a published model, next to its weights in the cache."""
 
 
 def is_cached(model: Published) -> bool:
-    """Return whether the cache has a published model's weights."""
+    """Return whether the weights of a published model are in the cache."""
     return _weights(model).is_file()
 
 
 def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
-    """Return a published model's weights in the cache; download and convert them the first time.
+    """Return a published model's weight file; download and convert the model the first time.
 
-    If two processes need it, one downloads and the other waits. The weights have their own
-    checksum, which `load_weights` checks. Another version of this package converts the published
-    file again, if its SHA-256 is still that of the first download.
+    If several processes need it, one downloads and the others wait. The weight file has its own
+    checksum, which `load_weights` checks. If another version of this package wrote the weight file,
+    the cached published file is converted again; its SHA-256 must still be that of the download.
 
     Args:
-        model: the published model.
+        model: the published model, as `published_model` returns it.
         quiet: whether to hide the progress bar.
 
     Returns:
-        The weight file.
+        The path of the weight file, a .safetensors file of this package in the cache.
 
     Raises:
-        InputError: what `download` and `read_checkpoint` raise; the file differs from the first
-            download, or is not this model; it is missing, and the network is disabled or it has no
-            address; torch is needed but not installed; or the cache cannot be written to.
+        InputError: the download fails; or the published file is unreadable, differs from the first
+            download, or is not this model; it is missing, and the network is disabled or no address
+            is known; torch is needed but not installed; or the cache cannot be written to.
     """
     if not _is_ready(model):
         try:

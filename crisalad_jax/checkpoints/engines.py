@@ -15,11 +15,11 @@ from crisalad_jax.utils.output import warn
 EngineName = Literal["onnxruntime", "openvino"]
 Precision = Literal["float32", "bfloat16"]
 Program = Callable[..., np.ndarray]
-"""A loaded program: a function from its inputs, in order, to its output."""
+"""A loaded program: a function of numpy arrays, its inputs in order, that returns its output."""
 
 
 class NotExportableError(InputError):
-    """A model that an engine cannot compute as JAX does; trying again would fail the same way."""
+    """An error for a model that an engine cannot compute as JAX does; retrying does not help."""
 
 
 class ProgramFormat(NamedTuple):
@@ -27,9 +27,9 @@ class ProgramFormat(NamedTuple):
 
     engine: EngineName
     suffixes: tuple[str, str]
-    """Suffixes of a program and of its weights."""
+    """Suffixes of the program file and of the weight file."""
     call: str
-    """How to run a program, with {file} for its file."""
+    """Python expression that runs a program, with {file!r} in place of its file name."""
 
 
 FORMATS: Mapping[str, ProgramFormat] = {
@@ -43,7 +43,7 @@ FORMATS: Mapping[str, ProgramFormat] = {
     ),
 }
 READS: Mapping[str, tuple[str, ...]] = {"onnxruntime": ("onnx",), "openvino": ("openvino", "onnx")}
-"""Formats that each engine reads, its own first."""
+"""Program formats (keys of `FORMATS`) that each engine reads, its own format first."""
 _TOOLS = "openvino.tools.ovc"
 _CAPABILITIES = "OPTIMIZATION_CAPABILITIES"
 
@@ -63,7 +63,7 @@ def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
 
 
 def import_openvino() -> Any:
-    """Import OpenVINO without its tools, whose import takes time and sends telemetry."""
+    """Import and return OpenVINO without its tools, whose import is slow and sends telemetry."""
     is_first = "openvino" not in sys.modules
     if is_first:
         sys.modules[_TOOLS] = None  # type: ignore[assignment]
@@ -88,18 +88,18 @@ def _openvino(path: pathlib.Path, precision: Precision) -> Program:
 def load_program(
     engine: EngineName, path: pathlib.Path, precision: Precision = "float32"
 ) -> Program:
-    """Load a program into an engine, on the CPU.
+    """Load a program into an engine that runs it on the CPU.
 
     Args:
-        engine: name of the engine.
-        path: a .onnx file, or OpenVINO's .xml; OpenVINO reads both.
-        precision: type of the matrix products; onnxruntime has only float32.
+        engine: "onnxruntime" or "openvino".
+        path: a .onnx file, or for OpenVINO also a .xml file.
+        precision: type of the matrix products; onnxruntime supports only "float32".
 
     Returns:
-        A function of the program's inputs.
+        A function of numpy arrays, the program's inputs in order, that returns its output.
 
     Raises:
-        InputError: the engine cannot read the file.
+        InputError: the engine cannot load the file, or does not support the precision.
         ModuleNotFoundError: the engine is not installed.
     """
     load = {"onnxruntime": _onnxruntime, "openvino": _openvino}[engine]
@@ -113,7 +113,7 @@ def load_program(
 
 
 def convert_to_openvino(program: pathlib.Path, out: pathlib.Path) -> None:
-    """Convert an ONNX program to OpenVINO's two files, `out` and its weights (.bin)."""
+    """Convert an ONNX file to OpenVINO's two files: `out` (.xml), and weights next to it (.bin)."""
     openvino = import_openvino()
     model = openvino.Core().read_model(program)
     # By default the weights are stored in half precision.

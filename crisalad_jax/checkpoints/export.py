@@ -1,8 +1,8 @@
 """Export a model as a program that runs without this package: StableHLO, ONNX or OpenVINO.
 
 An export is a folder with the program and a `manifest.json` that describes its inputs and outputs.
-The weights are in a separate file unless the program contains them. `jax.export` makes StableHLO,
-`onnx_format` makes ONNX, and OpenVINO converts the latter.
+The weights are in a separate file unless the program contains them. `jax.export` makes StableHLO
+programs and `onnx_format` ONNX programs, which OpenVINO can convert to its own format.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ from crisalad_jax.utils.target import PORTABLE, STRAIGHT, jax_setting, lowering_
 PROGRAM, WEIGHTS = "describe.jax_export", "weights.safetensors"
 FORMATS = ("stablehlo", *engines.FORMATS)
 TOLERANCE = 1e-5
-"""Largest difference of a program's descriptor values from those of `describe`, at unit length."""
+"""Largest allowed difference of a program's descriptors from `describe`'s, at unit length."""
 GROUPINGS = {
     "single": "every image is described independently",
     "batch": "the images of a call attend to each other",
@@ -68,7 +68,7 @@ _PROBES = 3
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class ExportConfig:
-    """The format, the inputs and the platforms of an exported program.
+    """The format, inputs and platforms of an exported program.
 
     Example:
         >>> ExportConfig(platforms=("cpu",), batch_size=8).grouping
@@ -76,22 +76,22 @@ class ExportConfig:
     """
 
     grouping: Literal["single", "batch", "any"] = "single"
-    """How images of a call attend to each other: "single", not at all; "batch", all to all; "any",
-    as a mask allows, in two ONNX or OpenVINO programs: images to tokens, tokens to descriptors."""
+    """Which images of a call attend to each other: "single", none; "batch", all; "any", those that
+    a mask allows, in two ONNX or OpenVINO programs: images to tokens, tokens to descriptors."""
     batch_size: int | None = None
     """Number of images in a call; None allows any number (a symbolic dimension)."""
     weights_inside: bool = False
-    """Whether the weights are constants of the program; if not, they are an argument."""
+    """Whether the program file contains the weights; otherwise they are in a separate file."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
-    """Platforms of StableHLO; the other formats run wherever their engines do."""
+    """Platforms that a StableHLO program is for; other formats run wherever their engines do."""
     format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
-    """StableHLO, which JAX runs; ONNX, which most engines read; or OpenVINO's own format."""
+    """StableHLO, which JAX runs; ONNX, which most engines read; or the format of OpenVINO."""
     pixels: Literal["bytes", "floats"] | None = None
-    """8-bit pixels, which the program normalises, or normalised floats; None is the type that the
-    model resizes."""
+    """Type of the input images: "bytes", 8-bit pixels, which the program normalises, or "floats",
+    already normalised; None is the type that the model resizes (`PreprocessingConfig.pixels`)."""
     for_colmap: bool = False
     """Whether an ONNX program has the inputs and outputs of COLMAP's draft of global-descriptor
-    retrieval: normalised floats (batch, 3, height, width) to `descriptor`."""
+    retrieval: `images`, normalised floats (batch, 3, height, width), and `descriptor`."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -116,12 +116,12 @@ class ExportConfig:
 
 
 def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -> None:
-    """Check that a model can be exported in this way, before tracing it.
+    """Check that a model can be exported as `how` specifies, without tracing it.
 
     Raises:
-        InputError: parameters of another configuration; 2 GiB or more of weights inside the
-            program; optimal transport that raises unless converged; float inputs with
-            local-contrast normalisation; normalisation other than ImageNet's for COLMAP; or a
+        InputError: the parameters are of another configuration; there are 2 GiB or more of weights
+            inside the program; optimal transport raises unless converged (`throw`); float inputs
+            with local-contrast normalisation; normalisation other than ImageNet's for COLMAP; or a
             compute type other than float32 in a format other than StableHLO.
     """
     check_params(params, config)
@@ -145,12 +145,12 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
 
 
 def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> export.Exported:
-    """Export the program of `(weights, images)`, or of `images` if the weights are inside.
+    """Export a model as a StableHLO function of `(weights, images)`, or of `images` alone.
 
-    `images` are RGB (batch, height, width, 3) of `config.input_size`: 8-bit, or normalised float32
-    if the model resizes floats. The result is their unit descriptors (batch, descriptor). `weights`
-    is a dictionary of the arrays by their dotted names. The program does not depend on the
-    exporting platform or on the caller. `check_exportable` checks what can be exported.
+    `weights`, a dictionary of the arrays by dotted names, is absent if `how.weights_inside` is set.
+    `images` are RGB (batch, height, width, 3) of `config.input_size`, uint8 or normalised float32
+    (`ExportConfig.pixels`). The function returns descriptors (batch, descriptor). It depends on
+    neither the exporting platform nor the caller. Call `check_exportable` first.
     """
     program = _whole_program(Model(params, config), how)
     run, weights, (images,) = program.run, program.weights, program.inputs.values()
@@ -238,18 +238,18 @@ def write_export(
     Args:
         out: the folder.
         model: parameters and configuration.
-        how: format, platforms, batch size and grouping.
-        calibration: prepared images from which onnxruntime calibrates int8 products, for ONNX and
-            OpenVINO. The manifest records how far descriptors then differ. None keeps float32.
+        how: format, inputs and platforms of the program.
+        calibration: prepared images (image, height, width, 3) that calibrate int8 matrix products,
+            for ONNX and OpenVINO; None keeps float32. The manifest records the difference.
 
     Returns:
         The content of manifest.json.
 
     Raises:
-        InputError: what `check_exportable` raises; `out` is a file, or a folder that is not empty;
-            or, in a format other than StableHLO, the model has an operation that the format lacks,
-            or the program's descriptors differ from those of `describe`.
-        ModuleNotFoundError: the extra of a format other than StableHLO is not installed.
+        InputError: `check_exportable` rejects the model; `out` is a file or a non-empty folder;
+            `calibration` comes with StableHLO, grouping "any", a batch size or weights inside; or
+            ONNX lacks an operation of the model, or descriptors differ from those of `describe`.
+        ModuleNotFoundError: the extra "onnx" or "openvino" is needed but not installed.
 
     Example:
         >>> import jax

@@ -1,4 +1,4 @@
-"""Load a model from a file, or a published one by its name."""
+"""Load a model from a file, or a published model by its name."""
 
 import dataclasses
 import os
@@ -20,28 +20,30 @@ if TYPE_CHECKING:
     from crisalad_jax.nn.model import Model
 
 HUB_FILE = "model.safetensors"
-"""Name of the weight file in a repository at Hugging Face's hub, or in a folder for one."""
+"""Name of the weight file in a repository on Hugging Face's hub, or in a folder published there."""
 
 
 @takes(path=PATH)
 def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = False) -> "Model":
-    """Load a model from a file of this package, a public checkpoint, or a published one by name.
+    """Load a model from a file of this package, a public checkpoint, or by a published name.
 
     Args:
         path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
-            DINO-SALAD, CricaVPR or another format in `docs/methods.md`; torch files need torch. Or
-            the name of a published model, as `crisalad models` lists them: it is downloaded once
-            into the cache. Or "starter", the small model in this package, or a baseline, "hog" or
-            "thumbnail". Or a folder that `crisalad publish` wrote; or hf://OWNER/NAME for such a
-            folder at Hugging Face's hub, optionally with @REVISION and /FILE (extra `data`).
-        verify: whether to check the bytes of a file of this package against its checksum.
+            DINO-SALAD, CricaVPR or another format (docs/how-to/use-public-checkpoints.md), which
+            needs torch; the name of a published model, as `crisalad models` lists them, which is
+            downloaded once into the cache; "starter", the small model in this package; "hog" or
+            "thumbnail", untrained baselines; a folder that `crisalad publish` wrote; or
+            hf://OWNER/NAME, such a folder on Hugging Face's hub, optionally with @REVISION and
+            /FILE (extra `data`).
+        verify: whether to check a file of this package against its checksum.
         quiet: whether to hide the progress of a download.
 
     Returns:
         The model: parameters and configuration.
 
     Raises:
-        InputError: what `read_checkpoint` and `find_weights` raise.
+        InputError: there is no such file or name, the download fails, or the file is damaged or of
+            an unknown format.
 
     Example:
         >>> import jax
@@ -61,26 +63,26 @@ def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = Fal
 def find_weights(
     weights: str | os.PathLike[str] | None, *, engine: str = "jax", quiet: bool = False
 ) -> pathlib.Path:
-    """Find the weight file for a path, or for the name of a published model.
+    """Find the weight file for a path, or for the name of a model.
 
-    None is the small model in this package, "starter", with a warning. Other names are "hog" and
-    "thumbnail", baselines that learn nothing. A published model is downloaded the first time. Its
-    licence is shown each time, but only once if it forbids commercial use: its file repeats it.
-    A file of such a name in the working directory takes precedence, with a warning.
+    Names are those of published models; "starter", the small model in this package; and "hog" and
+    "thumbnail", untrained baselines. A published model is downloaded the first time. Its licence is
+    shown in a warning: at every call, or once per process if it forbids commercial use. A file with
+    a model's name in the working directory takes precedence, with a warning.
 
     Args:
-        weights: a path, a name from `crisalad models`, or None; or hf://OWNER/NAME for a file at
-            Hugging Face's hub; or a folder with the layout of one at the hub.
-        engine: any but "jax" also accepts a folder; "auto" only that of an exported model.
+        weights: a path; a name; hf://OWNER/NAME, a repository on Hugging Face's hub; a folder with
+            the layout of such a repository; or None, which is "starter", with a warning.
+        engine: where the model will run; for "auto", an exported folder is accepted too, and for
+            engines other than "jax" any folder.
         quiet: whether to hide the progress bar.
 
     Returns:
-        The path; for a name, a file of this package in the cache; for the hub, one in its cache.
+        The path as given, or the path of the file for a name, in this package or in a cache.
 
     Raises:
-        InputError: what `cached_weights` and `download_file` raise; or there is neither such a file
-            nor such a name. The message lists the nearest names. Other missing files are left for
-            the reader to report.
+        InputError: a download fails, or there is neither a file nor a model of this name; the
+            message lists the nearest names. Other missing files are reported when they are read.
 
     Example:
         >>> find_weights("megalok")
@@ -145,9 +147,9 @@ class OpenedModel(NamedTuple):
 
     model: "Model | Runtime"
     name: str
-    """Its name for tables and titles."""
+    """Name of the model for tables and titles."""
     file: pathlib.Path
-    """The file, or for other engines the exported folder."""
+    """The weight file, or the exported folder, that was opened."""
 
 
 def open_model(
@@ -162,16 +164,15 @@ def open_model(
     """Load a model of this package in JAX, or open it in another engine.
 
     Args:
-        weights: a path or a name, as `find_weights` takes it; or for another engine an exported
-            folder.
-        engine: "jax", "onnxruntime" or "openvino".
-        changed: returns the configuration to describe images with, given the model's.
-        groupings: groupings of the images.
+        weights: a path or a name, as `find_weights` takes it.
+        engine: "jax", "onnxruntime" or "openvino"; the last two also take an exported folder.
+        changed: function of the model's configuration that returns the one to describe images with.
+        groupings: all groupings under which the model will describe images (`retrieval.grouping`).
         verify: whether to compare files with their checksums.
         quiet: whether to hide the progress of a download.
 
     Raises:
-        InputError: what `find_weights`, `load_weights`, `open_runtime` or `changed` raises.
+        InputError: as for `find_weights`, `load_weights` and `open_runtime`; or from `changed`.
     """
     file = find_weights(weights, engine=engine, quiet=quiet)
     short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name

@@ -1,7 +1,7 @@
-"""Read NetVLAD as its authors published it, in a MATLAB file, the way hloc does.
+"""Read NetVLAD from the MATLAB file that its authors published, as hloc does.
 
-scipy reads it without running any code in it. Axes of length 1 are dropped, as in hloc's reader.
-Names and axes of the result are those of hloc's own module.
+scipy reads the file without running any code in it. As in hloc, axes of length 1 are dropped, and
+the resulting arrays have the names and axes of hloc's torch module.
 """
 
 import pathlib
@@ -16,13 +16,13 @@ from crisalad_jax.utils.mat_files import load_mat
 MATLAB_SUFFIX = ".mat"
 _EXPECTED = "a MATLAB file of NetVLAD: net.layers with weights, and its averageImage"
 CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
-"""Numbers of the layers of VGG-16 that have weights."""
+"""Indices of the VGG-16 layers that have weights, in the file's list of layers."""
 _SCORES, _WHITENING = 30, 33
 """Numbers of the layers of NetVLAD's clusters, and of the whitening."""
 
 
 def read_matlab(path: pathlib.Path) -> Content:
-    """Read the weights of a network, and the mean of its images.
+    """Read the weights of NetVLAD, and the mean colour to subtract from images.
 
     Raises:
         InputError: the file is truncated, or holds another network.

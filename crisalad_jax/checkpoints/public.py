@@ -76,10 +76,11 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     """Read a public checkpoint, or a file of this package; half precision becomes float32 exactly.
 
     Torch files are read with `torch.load(weights_only=True)`, which runs no code in the file.
+    `verify` compares a file of this package with its checksum.
 
     Raises:
-        InputError: the file is missing, truncated, of none of the formats, asks to run code, or
-            does not fit its format (the first missing, unknown or misshaped names are listed).
+        InputError: the file is missing, damaged or of unknown format, asks to run code, or does not
+            fit its format (the first missing, unknown or misshaped names are listed).
         ModuleNotFoundError: torch is needed but not installed.
     """
     path = pathlib.Path(path)
@@ -137,17 +138,16 @@ def read_vocabulary(
     """Read a published AnyLoc vocabulary, which is a single tensor, and its backbone.
 
     Args:
-        path: the vocabulary.
-        backbone: any checkpoint that `read_checkpoint` reads; its backbone is used.
+        path: a torch file of one tensor, (words, width of the backbone's features).
+        backbone: any checkpoint that `read_checkpoint` reads; only its backbone is used.
         fields: settings of `AnyLocConfig` that shapes don't show: `layer`, `facet`, `assignment`.
 
     Returns:
-        A complete model. Images keep their sizes, except that sides are rounded to multiples of the
-        patch size.
+        A complete model, for images of any size, whose sides are rounded to whole patches.
 
     Raises:
-        InputError: what `read_checkpoint` raises for either file; or the vocabulary is not a single
-            tensor of words, or its words differ in width from the backbone's features.
+        InputError: `read_checkpoint` cannot read the backbone's file; or the vocabulary's file is
+            unreadable, or not a single tensor of words as wide as the backbone's features.
     """
     path = pathlib.Path(path)
     check_source(path, "a vocabulary")
@@ -163,7 +163,7 @@ def read_vocabulary(
 
 
 def vocabulary_model(words: int, model: ModelConfig, fields: Mapping[str, Any]) -> ModelConfig:
-    """Configure AnyLoc with `words` words on the backbone of a model; see `read_vocabulary`."""
+    """Return AnyLoc's configuration on a model's backbone; `fields` are as in `read_vocabulary`."""
     return dataclasses.replace(
         model,
         preprocessing=PreprocessingConfig(size_rule="native", pixels="floats"),
@@ -174,7 +174,7 @@ def vocabulary_model(words: int, model: ModelConfig, fields: Mapping[str, Any]) 
 
 
 def format_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
-    """Choose a public format for the target's suffix that can hold the complete model."""
+    """Return the name of a public format that fits `target`'s suffix and can hold the model."""
     is_safetensors = pathlib.Path(target).suffix in SUFFIXES["safetensors"]
     stored, fallback = ("safetensors", "huggingface") if is_safetensors else ("torch", REFERENCE)
     for name, each in FORMATS.items():
@@ -190,13 +190,14 @@ def format_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
 def write_checkpoint(
     path: str | os.PathLike[str], params: Crisalad, config: ModelConfig, format: str, extras: State
 ) -> None:
-    """Write a model under public names, as published: nested, prefixed, in the public order.
+    """Write a model as a public checkpoint, with the names, nesting and order of published files.
 
     Settings that names and shapes do not show, such as an image size other than the published one,
-    are stored in the metadata of the state, which other programs ignore.
+    are stored as metadata, which other programs ignore. `extras` are those of `Checkpoint`.
 
     Raises:
-        InputError: the format cannot hold this model, or the file cannot be written.
+        InputError: the format does not exist, cannot hold this model, or has another suffix than
+            `path`; or the file cannot be written.
         ModuleNotFoundError: torch is needed but not installed.
     """
     path = pathlib.Path(path)
@@ -219,7 +220,7 @@ def write_checkpoint(
 
 
 class Conversion(NamedTuple):
-    """A finished conversion: its source and target formats; None is this package's own."""
+    """A finished conversion: formats of source and target (None for this package's) and model."""
 
     source: str | None
     target: str | None
@@ -236,24 +237,24 @@ def convert(
     fields: Mapping[str, Any] | None = None,
     half: bool = False,
 ) -> Conversion:
-    """Convert a public checkpoint to a file of this package, or such a file to a public one.
+    """Convert a public checkpoint to a file of this package, or the reverse.
 
     Args:
-        source: a file that `read_checkpoint` reads.
-        target: file to write: .safetensors for a public source or `half`, else a public checkpoint.
-        format: public format of the target (`FORMATS`), for a source of this package; by default
-            one that can hold the model.
+        source: a public checkpoint (docs/how-to/use-public-checkpoints.md), or a file of this
+            package.
+        target: the file to write: a public checkpoint for a source of this package, unless `half`
+            is set; otherwise a .safetensors file of this package.
+        format: name of the public format to write, such as "reference"; None chooses one that fits.
         backbone: the backbone's checkpoint, for a source that is only an AnyLoc vocabulary.
-        fields: see `read_vocabulary`.
-        half: whether to write a file of this package in half precision, from either kind of source;
-            see `save_weights`.
+        fields: settings of such a vocabulary: `layer`, `facet`, `assignment` of `AnyLocConfig`.
+        half: whether to write a file of this package in float16, from either kind of source.
 
     Returns:
         The formats of source and target, and the model's configuration.
 
     Raises:
-        InputError: what `read_checkpoint` and `write_checkpoint` raise, or the target or format
-            does not match the source. Nothing is written in that case.
+        InputError: the source cannot be read, the model does not fit the format, or the target or
+            format does not match the source. Nothing is written in that case.
 
     Example:
         >>> import jax
@@ -293,20 +294,21 @@ def convert(
 def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) -> Any:
     """Read the backbone of any checkpoint, for a model with the backbone `config`.
 
-    Adapters are read if the file's have the same kind and sizes; otherwise `fresh` provides them.
-    If the file's ResNet has more stages, the first ones are used.
+    Adapters in the file are used if they have the kind and sizes of `config`; otherwise those of
+    `fresh` are. If the file's ResNet has more stages than `config`, the first ones are used.
 
     Args:
-        path: a file that `read_checkpoint` reads.
+        path: a public checkpoint (docs/how-to/use-public-checkpoints.md), or a file of this
+            package.
         config: configuration of the model's backbone.
-        fresh: parameters of such a backbone, whose adapters replace missing or different ones.
+        fresh: parameters of a backbone with that configuration, such as `config.init` makes.
 
     Returns:
         The backbone's parameters.
 
     Raises:
-        InputError: what `read_checkpoint` raises, or the backbone is a different one (all fields
-            that differ are listed).
+        InputError: the file cannot be read, or has a different backbone (all fields that differ
+            are listed).
 
     Example:
         >>> import jax
@@ -333,6 +335,6 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
 def with_backbone_of(
     params: Crisalad, config: ModelConfig, path: str | os.PathLike[str]
 ) -> Crisalad:
-    """Return a model's parameters with the backbone of any checkpoint; see `read_backbone`."""
+    """Return a model's parameters with the backbone of the checkpoint `path` (`read_backbone`)."""
     backbone = read_backbone(path, config.backbone, params.backbone)
     return dataclasses.replace(params, backbone=backbone)

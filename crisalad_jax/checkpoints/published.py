@@ -1,4 +1,4 @@
-"""Models that others published, by name, from the table of their files in published.toml."""
+"""Models that others published, by name, from the list of their files in published.toml."""
 
 import dataclasses
 import difflib
@@ -25,7 +25,7 @@ class Licence:
     commercial: bool | None = None
     """Whether it allows commercial use; None if the repository does not say."""
     terms: str = ""
-    """What else a user must know about it."""
+    """What else a user must know about the licence; empty if nothing."""
 
     def __post_init__(self) -> None:
         """Check the types."""
@@ -33,7 +33,7 @@ class Licence:
 
     @property
     def words(self) -> str:
-        """The licence, and what a user must know about it."""
+        """The licence in words, with what a user must know about it."""
         if self.commercial is None:
             return f"{self.name}: its authors have not said who may use it"
         terms = self.terms if self.commercial else "no commercial use"
@@ -47,27 +47,27 @@ class Published:
     name: str
     """Name for `--weights` and `load`, of lower-case letters, digits and hyphens."""
     format: str
-    """Format of the file."""
+    """Name of the file's format, as `crisalad convert --format` takes it."""
     descriptor: int
     """Dimensions of a descriptor."""
     parameters: int
     """Number of parameters, as `crisalad info` counts them."""
     images: str
-    """How images are resized, as the configuration of its format describes it."""
+    """How images are resized, in words, such as "224 x 224, bilinear (Pillow)"."""
     licence: Licence
     repository: str
     """Address of the page that publishes the file."""
     file: str
     """Name of the file, also at a mirror."""
     url: str | None
-    """Address of the file; None if it has no separate one, as in a folder or an archive."""
+    """Address of the file; None if it has none of its own, as in a shared folder or an archive."""
     paper: str
     """Authors, venue and year."""
     backbone: str = ""
     """Name of the published model whose backbone the file's vocabulary is for; empty if the file is
     a complete model."""
     note: str = ""
-    """What is uncertain about these facts, or has to be done by hand."""
+    """What is uncertain about these facts, or how to get the file by hand; may be empty."""
 
     def __post_init__(self) -> None:
         """Check the types."""
@@ -75,7 +75,7 @@ class Published:
 
     @property
     def notice(self) -> str:
-        """The licence, and the repository that it applies to."""
+        """The licence in words, and the repository that it applies to."""
         return f"{self.licence.words} ({self.repository})"
 
     @property
@@ -92,14 +92,14 @@ _LICENCES: dict[str, Licence] = {}
 def register_published(text: str) -> None:
     """Register custom published models, and how their files name a model's arrays.
 
-    Their names then work in `load`, `--weights`, `convert`, `models` and `compare`. A file FILE.py
-    that calls this is all that `--plugin FILE.py` needs; it can also register the parts of the
-    model.
+    The names of the models then work in `load`, `--weights`, `crisalad models` and `compare`, and
+    those of the formats in `convert`. A plug-in FILE.py (`--plugin FILE.py`) can call this, and
+    register parts of the models too.
 
     Args:
         text: TOML with the sections of this package's `published.toml` (licence, family) and of its
             `formats.toml` (chains, tables, backbones, heads, formats). It may refer to names in
-            those two, but cannot replace them.
+            those two files, but not define them again.
 
     Raises:
         InputError: the text is not such TOML, a name is taken, or the format or licence of a model
@@ -182,7 +182,7 @@ def _models(family: dict[str, Any], licences: dict[str, Licence]) -> Iterator[Pu
 
 
 def published_model(name: str) -> Published:
-    """Look up a published model.
+    """Return the published model of this name.
 
     Raises:
         InputError: there is no such model; the message lists the nearest names.
@@ -206,7 +206,7 @@ def restriction_of(format: str) -> str:
 
 
 def nearest_names(name: str) -> str:
-    """Return the published names closest to this one, as the end of a message."""
+    """Return up to three model names similar to `name`, as the end of a message; "" if none."""
     plain = _plain(name)
     words = {each: _plain(f"{each} {m.file} {m.repository}") for each, m in PUBLISHED.items()}
     near = [each for each, own in words.items() if plain in own or plain.replace("-", "") in own]

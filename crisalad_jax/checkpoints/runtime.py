@@ -1,6 +1,6 @@
-"""Open an exported folder as a model in an engine other than JAX. Nothing here imports jax.
+"""Open an exported folder, or a weight file, as a model in an engine other than JAX.
 
-A weight file is exported once, into the user's cache.
+A weight file is exported once, into the user's cache. Importing this module does not import jax.
 """
 
 import concurrent.futures
@@ -50,15 +50,15 @@ FORMAT = "crisalad-jax export 1"
 MANIFEST = "manifest.json"
 _EXPECTED = "the manifest of `crisalad export`"
 DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
-"""Names of programs: images to descriptors, images to tokens, and tokens to descriptors."""
+"""Names of the programs: images to descriptors, images to tokens, and tokens to descriptors."""
 
 
 @brief
 @dataclasses.dataclass(frozen=True)
 class Runtime:
-    """A model in an engine, used in place of its parameters.
+    """A model opened in an engine other than JAX, to use in place of a `Model`.
 
-    It computes the descriptors of `describe`, for images of one size.
+    It computes the same descriptors as `describe`, for images of one size.
     """
 
     folder: pathlib.Path
@@ -67,9 +67,9 @@ class Runtime:
     digest: str
     """The `model_hash` of the exported weights; an int8 program has its own digest."""
     quantised_from: str | None
-    """The `model_hash` of the weights that an int8 program was made from."""
+    """The `model_hash` of the weights that an int8 program was made from; None for float32."""
     grouping: str
-    """How the programs group images; see `export.GROUPINGS`."""
+    """Which images attend to each other: "single", "batch" or "any" (`export.GROUPINGS`)."""
     attends: bool
     """Whether a descriptor depends on the other images of its batch."""
     dim: int
@@ -77,9 +77,9 @@ class Runtime:
     input_size: Size
     """Height and width of the images that the programs take."""
     fixed_batch: int | None
-    """Number of images in every call; None is any."""
+    """Number of images that each call of the program takes; None if any number."""
     preparation: Preparation
-    """How photographs are prepared."""
+    """How photographs are prepared for the programs."""
     model: Mapping[str, Any]
     """The configuration, with the image size and compute type of this engine, as JSON values."""
     _first: Program
@@ -100,14 +100,14 @@ class Runtime:
 
     @property
     def row_length(self) -> int:
-        """Number of values in the row of an image's tokens."""
+        """Number of values in the row that `tokens` returns for an image."""
         return self.dim if self._second is None else self.config.unprojected_dim
 
     def check_groupings(self, groupings: Iterable[str]) -> None:
-        """Check that the program can describe images under these groupings.
+        """Check that the model can describe images under groupings such as "window/single".
 
         Raises:
-            InputError: the program has another grouping.
+            InputError: the model was exported for another grouping.
         """
         if not self.attends or self.grouping == "any":
             return
@@ -119,12 +119,12 @@ class Runtime:
             )
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[np.ndarray, ImageBatch]]:
-        """Yield each batch with a row of values for each of its images, which `attend` reads."""
+        """Yield (rows, batch) for each batch: rows (image, number) of tokens, for `attend`."""
         for batch in batches:
             yield self._rows(batch.images), batch
 
     def describe(self, images: np.ndarray) -> np.ndarray:
-        """Describe prepared images, each independently (or all together: see `grouping`).
+        """Describe prepared images: each independently, or together if `grouping` is "batch".
 
         Args:
             images: (image, height, width, 3) of `input_size`, as `preparation` makes them.
@@ -157,10 +157,10 @@ class Runtime:
 
         Args:
             rows: rows from `tokens`, (group, image, number).
-            mask: `mask[g, i, j]` allows image i of group g to attend to image j.
+            mask: `mask[g, i, j]` lets image i of group g attend to image j.
 
         Returns:
-            Descriptors (group, image, dim).
+            Descriptors (group, image, dim). Unless `grouping` is "any", they are the rows as given.
         """
         if self._second is None:
             return rows
@@ -176,7 +176,7 @@ def open_runtime(
     any_grouping: bool = False,
     verify: bool = True,
 ) -> Runtime:
-    """Open a model in an engine.
+    """Open a model in an engine other than JAX.
 
     JAX is imported only if `source` is a weight file that was not exported before.
 
@@ -185,17 +185,17 @@ def open_runtime(
             of this package.
         engine: "onnxruntime" or "openvino".
         config: a `ModelConfig` as JSON values, which sets image size, preprocessing and compute
-            type; None is the model's own, in float32. Only OpenVINO has bfloat16.
+            type; None uses the model's own, in float32. Only OpenVINO supports bfloat16.
         any_grouping: whether to export a weight file for any grouping of images, rather than for
-            single images.
+            images that are described independently.
         verify: whether to compare files with their checksums.
 
     Returns:
         The model.
 
     Raises:
-        InputError: there is no such folder or file, or it is damaged, of another format or for
-            other images; or what `write_export` raises.
+        InputError: there is no such folder or file; it is damaged, of a format that the engine does
+            not read, or for images of another size or type; or a weight file cannot be exported.
         ModuleNotFoundError: the engine is not installed.
 
     Example:
@@ -251,15 +251,15 @@ def fastest_engine(
 ) -> EngineName | Literal["jax"]:
     """Choose the fastest engine for single images, among those that compute what JAX does.
 
-    ONNX Runtime comes before OpenVINO, which is as fast but takes longer to start
-    (docs/performance.md). The engine must be installed. The first time, the model is exported for
-    it, and the export compares descriptors with JAX's. JAX is chosen if it may have an accelerator,
-    for bfloat16, for images without a fixed size, with plug-ins, and if no engine can be used.
+    Only installed engines are considered: ONNX Runtime first, then OpenVINO, which is as fast but
+    takes longer to start (docs/performance.md). A weight file is exported for the engine once, and
+    its descriptors are compared with JAX's. JAX is chosen if it may have an accelerator, for
+    bfloat16, for images without a fixed size, with plug-ins, and if no engine can be used.
 
     Args:
         source: a weight file, or an exported folder.
-        config: a `ModelConfig` as JSON values, as `open_runtime` takes it.
-        any_grouping: see `open_runtime`.
+        config: the `ModelConfig` to describe images with, as JSON values.
+        any_grouping: whether images may attend to each other, as `open_runtime` takes it.
 
     Raises:
         InputError: `source` is an exported folder that no installed engine reads.
@@ -432,10 +432,10 @@ def _export(
 
 
 def check_takes_photographs(config: "ModelConfig", source: object) -> None:
-    """Check that a model's program takes photographs, not features of them.
+    """Check that a model takes photographs, which engines need, and not SIFT or ORB features.
 
     Raises:
-        InputError: the program takes features.
+        InputError: the model takes features; `source`, its file, begins the message.
     """
     if config.backbone.local_features is not None:
         raise NotExportableError(
@@ -445,10 +445,10 @@ def check_takes_photographs(config: "ModelConfig", source: object) -> None:
 
 
 def read_model(source: str | os.PathLike[str]) -> "ModelConfig":
-    """Read the configuration in a weight file or an exported folder, without its arrays.
+    """Read a model's configuration from a weight file or an exported folder, without arrays.
 
     Raises:
-        InputError: what `read_header` raises, or the manifest or the configuration is invalid.
+        InputError: the file is missing or not a weight file, or its configuration is invalid.
     """
     from crisalad_jax.nn.config import ModelConfig
 

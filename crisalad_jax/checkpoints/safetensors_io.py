@@ -32,7 +32,7 @@ EXPECTED_WEIGHTS = (
 def write_safetensors(
     path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
 ) -> None:
-    """Write arrays and texts as a safetensors file, atomically.
+    """Write arrays, and texts as metadata, to a safetensors file, atomically.
 
     Raises:
         InputError: the file cannot be written.
@@ -58,13 +58,13 @@ def write_sealed(
     form: str,
     value: Mapping[str, Any],
 ) -> None:
-    """Write arrays and an object with the checksum of both, atomically.
+    """Write arrays and a JSON object, with the checksum of both, to a safetensors file, atomically.
 
     Args:
         path: the file.
         arrays: arrays by name.
-        form: the format and its version, the only key of the metadata, because safetensors does not
-            preserve the order of several.
+        form: the format and its version: the only key of the metadata, because safetensors does not
+            preserve the order of several keys.
         value: the object, as JSON values.
 
     Raises:
@@ -103,11 +103,11 @@ def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Any]:
 def read_safetensors(
     path: str | os.PathLike[str], expected: str
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Read the metadata and the arrays of any safetensors file.
+    """Read (metadata, arrays by name) from any safetensors file.
 
     Args:
         path: the file.
-        expected: what kind of file, for messages.
+        expected: description of the kind of file, for messages.
 
     Raises:
         InputError: the file is missing, incomplete or of another kind, or has a type NumPy lacks.
@@ -118,13 +118,13 @@ def read_safetensors(
 
 
 def read_metadata(path: str | os.PathLike[str], expected: str) -> dict[str, str]:
-    """Read the metadata of any safetensors file, without arrays; see `read_safetensors`."""
+    """Read only the metadata of any safetensors file; arguments as for `read_safetensors`."""
     with _opened(path, expected) as file:
         return file.metadata() or {}
 
 
 def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read the header of a weight file, without its arrays.
+    """Read the header of a weight file of this package, without its arrays.
 
     The checksum is not verified.
 
@@ -132,7 +132,7 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
         weights: the file.
 
     Returns:
-        The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values.
+        The fields of `weights.Header` as JSON values, such as "model_sha256" and "config".
 
     Raises:
         InputError: the file is missing, incomplete, or not a weight file of this package.
@@ -147,12 +147,12 @@ def read_sealed(
 
     Args:
         path: the file.
-        form: its format.
-        expected: what kind of file, for messages.
+        form: its format, as `write_sealed` took it.
+        expected: description of the kind of file, for messages.
         verify: whether to compare its contents with the checksum.
 
     Returns:
-        The object next to the arrays, without its checksum, and the arrays by name.
+        (the JSON object without the checksum, arrays by name).
 
     Raises:
         InputError: the file is missing, incomplete, changed or of another format.

@@ -1,9 +1,9 @@
 """The models in this package, available without a download: a small one, and baselines.
 
-docs/starter.md says how the small one was trained, only on rendered images, and what it recalls.
-Histograms of oriented gradients and SeqSLAM's thumbnails have no parameters: their files hold only
-a configuration. None of them is a published model: the files are part of the package, under its
-licence.
+docs/starter.md describes how the small one was trained, only on rendered images, and its recall.
+The baselines, histograms of oriented gradients ("hog") and SeqSLAM's thumbnails, have no
+parameters: their files hold only a configuration. All files are under the licence of this package,
+and none of these models counts as a published one.
 """
 
 import os
@@ -21,7 +21,7 @@ BEST = "megaloc"
 
 
 def named(weights: str | os.PathLike[str]) -> str:
-    """Return what to call a weight file in output: its path, or the name of a model here."""
+    """Return the name to print for a weight file: that of a model in this package, or its path."""
     names = (name for name, file in FILES.items() if file == pathlib.Path(weights))
     return next(names, os.fspath(weights))
 
@@ -29,7 +29,7 @@ def named(weights: str | os.PathLike[str]) -> str:
 def recorded(weights: str | os.PathLike[str]) -> str:
     """Return what a map records as its weights: a path, or the name of a model in this package.
 
-    A map may be moved to another machine, where the package is at another path.
+    A name remains valid on another machine, where the package is at another path.
     """
     path = real_path(pathlib.Path(weights))
     if os.fspath(weights) in FILES and not path.exists():

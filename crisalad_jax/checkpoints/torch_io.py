@@ -18,8 +18,8 @@ from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 
 DECLARED = "crisalad-jax"
-"""Key of the description of the model in public checkpoints that we write. It is in the metadata of
-the state, which other programs ignore."""
+"""Key of the description of the model in public checkpoints that this package writes. It is in the
+metadata of the state dict, which other programs ignore."""
 HOW = "torch.save(model.state_dict(), FILE) writes a file of only the weights"
 _UNDER = ("state_dict", "model_state_dict", "model", "teacher")
 """Keys under which files store the state."""
@@ -39,9 +39,9 @@ class Content(NamedTuple):
     state: dict[str, np.ndarray]
     """Arrays by name."""
     declared: str | None = None
-    """Its description of the model, as JSON, if we wrote it."""
+    """Description of the model as JSON, if this package stored one; otherwise None."""
     mean: tuple[float, float, float] | None = None
-    """Mean red, green and blue to subtract from pixels of 0 to 1, if it specifies them."""
+    """Mean red, green and blue to subtract from pixels of 0 to 1; None if not in the checkpoint."""
 
 
 class _Numpy:
@@ -100,7 +100,7 @@ def _stand_in(name: str) -> type:
 
 
 def read_torch(path: pathlib.Path) -> Content:
-    """Read the state in a file, whichever key it is under.
+    """Read the state dict of a torch file, under any of the usual keys or at the top level.
 
     Raises:
         InputError: the file is incomplete, asks to run code, or holds anything but named tensors.
@@ -173,10 +173,10 @@ def _kind(value: Any) -> str:
 
 
 def read_tensor(path: pathlib.Path) -> np.ndarray:
-    """Read a file that holds a single tensor.
+    """Read a torch file that holds a single tensor.
 
     Raises:
-        InputError: what `read_torch` raises; or the file holds something else.
+        InputError: the file is incomplete, asks to run code, or holds anything else.
     """
     return _array(path, "the content", _load(path))
 
@@ -275,14 +275,14 @@ def write_torch(
     bare: bool,
     declared: str | None,
 ) -> None:
-    """Write a state as torch does, atomically.
+    """Write arrays as a torch file, atomically.
 
     Args:
         path: the file.
-        state: arrays by name.
-        under: key of the file's dictionary that holds the state; empty if the file is the state.
-        bare: whether the file is just the one tensor.
-        declared: see `Content`.
+        state: arrays by name, the state dict.
+        under: key of the file's dictionary for the state dict; empty puts it at the top level.
+        bare: whether to write just the one tensor, without a dictionary.
+        declared: the model's description, as in `Content`; None writes none.
 
     Raises:
         InputError: the file cannot be written.

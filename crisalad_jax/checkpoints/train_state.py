@@ -1,4 +1,4 @@
-"""Save and load the states that a run resumes from.
+"""Save and load the states from which a training run resumes.
 
 orbax writes the states. In a test that flipped 40 single bits in a stored state, orbax and
 tensorstore detected none, and 39 changed the loaded values. The SHA-256 of every file is therefore
@@ -49,7 +49,7 @@ sys.unraisablehook = _show_but_late
 
 
 class SavedState(NamedTuple):
-    """A restored state of a run."""
+    """A restored state of a run: its training step, its arrays, and the JSON record with them."""
 
     step: int
     state: Any
@@ -57,10 +57,10 @@ class SavedState(NamedTuple):
 
 
 class StateStore:
-    """The resumable states of a run (orbax): each step is written atomically."""
+    """A folder of the states from which a run can resume; orbax writes each one atomically."""
 
     def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
-        """Open or create the folder, which holds the last `keep` states."""
+        """Open or create the folder, in which only the last `keep` states are stored."""
         folder = pathlib.Path(folder).absolute()
         self._folder, self._dropped = folder, folder / _DROPPED
         # Only the primary process has a store: without this orbax would wait for the others.
@@ -88,9 +88,9 @@ class StateStore:
         self._clear()
 
     def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
-        """Write the arrays of `state` and the JSON values of `record`, replacing a state of `step`.
+        """Write the arrays of `state` and the JSON values of `record` as the state of `step`.
 
-        It copies the arrays before it returns, and writes the copies in the background.
+        It replaces any state of that step. It copies the arrays, and writes them in the background.
 
         Raises:
             InputError: this state, or an earlier one, cannot be written.
@@ -107,13 +107,13 @@ class StateStore:
             )
 
     def load(self, template: PyTree) -> SavedState | None:
-        """Restore the last state.
+        """Restore the last saved state.
 
         Args:
-            template: a state of the same structure and shapes.
+            template: a state of the same structure, shapes and types.
 
         Returns:
-            The state; None if there is none.
+            The state; None if none was saved.
 
         Raises:
             InputError: the stored arrays are damaged or do not fit the template.
@@ -169,12 +169,12 @@ class StateStore:
         ]
 
     def wait(self) -> None:
-        """Wait until all saved states are on disk; raise what `save` raises."""
+        """Wait until all states are on disk; raise InputError if one cannot be written."""
         with self._written():
             self._manager.wait_until_finished()
 
     def close(self) -> None:
-        """Wait for pending writes and close the store; raise what `save` raises."""
+        """Wait until all states are on disk, and close the store; raise as `wait` does."""
         with self._written():
             self._manager.close()
         self._clear()

@@ -1,4 +1,4 @@
-"""Read and write weight files: safetensors with the configuration and the sources of its parts."""
+"""Read and write weight files: safetensors files with a model's arrays and configuration."""
 
 import dataclasses
 import hashlib
@@ -41,22 +41,22 @@ class Header:
 
     config: ModelConfig
     version: str
-    """Version of this package that wrote it."""
+    """Version of this package that wrote the file."""
     parts: dict
-    """Name and source digest of every part."""
+    """Name and source digest of every part, by its field (`config.plugins.sources_of`)."""
     model_sha256: str
     """The `model_hash` of the parameters."""
     aggregator: dict = dataclasses.field(default_factory=dict)
-    """Found in earlier files; ignored."""
+    """A field of earlier files, ignored."""
     loss: dict = dataclasses.field(default_factory=dict)
-    """The run's loss, a `LossConfig` as JSON values, if the file has its parameters."""
+    """The run's `LossConfig` as JSON values, if the file has the loss's parameters; else empty."""
     restriction: str = ""
     """Notice of a licence that forbids commercial use; empty otherwise."""
 
 
 @brief
 class Checkpoint(NamedTuple):
-    """A model from any file we can read."""
+    """A model that was read from a file, and what else the file holds."""
 
     params: Crisalad
     config: ModelConfig
@@ -69,7 +69,7 @@ class Checkpoint(NamedTuple):
     loss: tuple[dict, dict[str, np.ndarray]] | None = None
     """`Header.loss` and the loss's parameters by name, if the file has them."""
     restriction: str = ""
-    """`Header.restriction`, or that of the public format."""
+    """`Header.restriction`, or for a public checkpoint `restriction_of` its format."""
 
     @property
     def model(self) -> Model:
@@ -87,21 +87,21 @@ def save_weights(
     loss: tuple[Any, Any] | None = None,
     restriction: str = "",
 ) -> None:
-    """Write parameters under their dotted names, and the configuration in the file's metadata.
+    """Write a model as a safetensors file: arrays by dotted name, the configuration as metadata.
 
     Args:
         path: the .safetensors file.
         model: all parameters, and the configuration.
-        extras: arrays of a public checkpoint that no descriptor needs (see `convert`).
+        extras: arrays of a public checkpoint that no descriptor needs, for converting it back.
         half: whether to store float32 parameters as float16, in half the space. They are rounded,
             and become float32 again when they are read.
         loss: the `LossConfig` of a run, and the loss's learnt parameters, for `load_loss`. The
             model and its digest do not depend on it.
-        restriction: notice of a licence that forbids commercial use, which is shown at load.
+        restriction: notice of a licence that forbids commercial use, shown when the file is loaded.
 
     Raises:
-        InputError: `load_weights` would reject the parameters; the folder cannot be made, or the
-            file cannot be written.
+        InputError: the parameters do not fit the configuration or are not finite; the folder cannot
+            be made, or the file cannot be written.
 
     Example:
         >>> import jax, tempfile
@@ -149,12 +149,12 @@ def load_weights(
 ) -> Model:
     """Read the model that `save_weights` wrote.
 
-    Warn if a part's source has changed since the weights were written.
+    It warns if the source code of a plug-in's part has changed since the file was written.
 
     Args:
-        path: the file; `find_weights` finds the file of a name.
+        path: the file; `find_weights` finds the file of a named model.
         expected: if given, the configuration that the file must have, except for what parameters
-            do not depend on: image size (except for MixVPR), dropout, compute type, remat.
+            do not depend on: image size (except for MixVPR), resize, dropout, compute type, remat.
         verify: whether to check the file against its checksum.
 
     Returns:
@@ -184,10 +184,10 @@ def load_weights(
 
 
 def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
-    """Read everything that `save_weights` wrote; see `load_weights`.
+    """Read everything that `save_weights` wrote, with the arguments of `load_weights`.
 
     Raises:
-        InputError: what `load_weights` raises.
+        InputError: in the cases in which `load_weights` without `expected` raises it.
     """
     try:
         value, arrays = read_sealed(path, FORMAT, EXPECTED, verify=verify)
@@ -220,13 +220,13 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
 
 
 def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None:
-    """Check that a configuration is plausible for some arrays.
+    """Check that the sizes in a file's configuration are plausible for the arrays in the file.
 
-    This runs before anything is made from the configuration: a file may claim any sizes.
+    Call it before making anything from the configuration: a file may claim any sizes.
 
     Args:
         plain: the configuration, as JSON values.
-        arrays: the arrays.
+        arrays: all arrays in the file.
         source: the file, for messages.
 
     Raises:
@@ -245,9 +245,9 @@ def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None
 def model_hash(params: Crisalad, config: ModelConfig) -> str:
     """Compute a digest of all that determines descriptors, except image size and rounding.
 
-    The digest covers the parameters' names, types, shapes and values. It also covers the
-    configuration's fields that outputs depend on, if they differ from their defaults. It is the
-    same for a copy in another layout, and for a version of this package with more fields.
+    It covers the names, types, shapes and values of the parameters, and the configuration's fields
+    that outputs depend on and that differ from their defaults (for MixVPR also the image size). It
+    is the same for a copy in another memory layout, and in a later version with more fields.
 
     Args:
         params: all parameters of the model.

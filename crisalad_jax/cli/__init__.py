@@ -1,7 +1,7 @@
-"""The command line: parse, make a configuration, call the library; a module for each command.
+"""The command line: a module for each command, which parses its flags and calls the library.
 
 Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 143 ended by
-SIGTERM, 129 by SIGHUP, 1 anything else.
+SIGTERM, 129 by SIGHUP, 134 a process of the run was lost (also 2), 1 anything else.
 """
 
 import dataclasses
@@ -134,10 +134,10 @@ def _numbers(flag: str, value: Any) -> Iterator[tuple[str, int]]:
 
 
 def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False) -> int:
-    """Run one command, and return its exit code.
+    """Run the command that `arguments` (by default `sys.argv[1:]`) name; return its exit code.
 
-    Set `keep_programs`, which caches compiled programs (`utils.executable_cache`), only in a
-    dedicated process, where nothing else changes the code.
+    `keep_programs` caches compiled programs (`utils.executable_cache`). Set it only in a process
+    that runs nothing but this package, where nothing else changes the code.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given[:1] == ["help"]:  # as in git

@@ -8,11 +8,11 @@ from crisalad_jax.cli.compare import ComparisonFlags, names_of, run_comparison
 
 
 class Ablate(ComparisonFlags):
-    """Train CriSALAD with one part changed at a time; show what adapters cost (Tables 2 and 3)."""
+    """Train CriSALAD with one part changed at a time, and show costs (the paper's Tables 2, 3)."""
 
     rows: str | None = None
     """Comma-separated; by default the paper's: crisalad, lr-1e-4, step, multi-resolution, mlp,
-    no-adapter, no-encoder, no-encoder-step. Any registered part is a row too, as NAME or KIND:NAME:
+    no-adapter, no-encoder, no-encoder-step. NAME or KIND:NAME of a registered part is a row too:
     CriSALAD with that part. With --row the default is only crisalad."""
     row: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A custom row, as "NAME: flag=value, flag=value" with any flags of `train` that set the model,
@@ -22,7 +22,7 @@ class Ablate(ComparisonFlags):
 
 
 def run(arguments: Ablate) -> dict[str, Any]:
-    """Train the rows of the ablation, and print the tables."""
+    """Train the rows of the ablation, and print the tables; return the result for --json."""
     from crisalad_jax.experiments.comparison import ABLATIONS
 
     if arguments.rows is not None:

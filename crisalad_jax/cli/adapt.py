@@ -13,23 +13,23 @@ from crisalad_jax.training.recipes import recipe
 
 
 class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
-    """Adapt a map's model to the map's environment in a few steps; resume the run in OUT."""
+    """Adapt a map's model to its environment in a few steps; resume the run in OUT, if any."""
 
     map: pathlib.Path
-    """Map whose model is adapted; its images must be where they were indexed."""
+    """Map whose model is adapted; its images must still be where they were indexed."""
     out: Annotated[pathlib.Path, FOLDER]
     """Folder for adapted.safetensors, the run and the measurements."""
     settings: Any
     weights: pathlib.Path | None = None
-    """Weights that made the map, if they were moved since."""
+    """Weights that made the map, if their file has moved since."""
     images: tuple[pathlib.Path, ...] = ()
     """More images of the place to train on, such as those of another day; they aren't added to
     the map."""
     place_radius: float | None = None
     """Radius in metres around a place's centre, for a map with positions; by default 10."""
     place_frames: int | None = None
-    """Number of consecutive images in a place, for a map without positions; by default each image
-    is one, seen under two augmentations."""
+    """Number of consecutive images in a place, for a map without positions; by default 1, which is
+    seen under two augmentations."""
     watch: tuple[pathlib.Path, ...] = ()
     """Evaluation sets of other places, whose recall is compared before and after."""
     most_lost: float = 0.005
@@ -39,7 +39,7 @@ class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
 
 
 def parse(program: str, arguments: Sequence[str]) -> Adapt:
-    """Parse the flags, with one for every field of the configuration and of its parts."""
+    """Parse the flags, which include one for every field of the configuration and its parts."""
     return parse_settings(Adapt, program, arguments, *defaults(arguments))
 
 
@@ -49,7 +49,7 @@ def command(arguments: Sequence[str]) -> type:
 
 
 def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
-    """Return the configuration that flags start from, and the preset that sizes its parts."""
+    """Return the configuration that the flags change, and the name of the preset for its parts."""
     folder = find_flag(arguments, "--map")
     if folder is None or not pathlib.Path(folder).exists():
         return recipe("b14", "adapt"), "b14"
@@ -58,7 +58,7 @@ def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
 
 
 def run(arguments: Adapt) -> dict[str, Any]:
-    """Adapt the model, and print the gain."""
+    """Adapt the model, and print the gain; return the result for --json."""
     from crisalad_jax.experiments.adapt import adapt, to_json
 
     config: TrainConfig = arguments.settings

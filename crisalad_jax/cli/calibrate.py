@@ -17,23 +17,23 @@ from crisalad_jax.retrieval.verification.verify import Verify
 class Calibrate(ReadFlags, SetFlags, MapFlags, TableFlags):
     """Measure the similarity above which a map's answers are correct, and store it in the map.
 
-    Every image is described independently, at the map's size, by the map's model. The set's
-    database should show the map's places, or about as many similar ones, and its queries should be
-    like those that the map will get, including unknown places. `crisalad query` then answers
+    Every image is described independently by the map's model, at the map's image size. The database
+    of the set should show the map's places, or about as many similar ones, and its queries should
+    be like those that the map will get, including unknown places. `crisalad query` then answers
     "unknown" to images below that similarity. An earlier calibration is replaced.
     """
 
     precision: float = 0.99
     """Share of the answers that must be correct."""
     verify: int | None = None
-    """Verify this many answers, and measure the inliers, not the similarity, that the best needs
-    (docs/verification.md); stored separately, for `crisalad query --verify`."""
+    """Number of answers to verify, to measure how many inliers (not what similarity) the best one
+    needs (docs/verification.md); stored separately, for `crisalad query --verify`."""
     matcher: pathlib.Path | None = None
-    """ONNX file of the matcher that verifies; by default SIFT."""
+    """With --verify: ONNX file of the matcher; by default SIFT."""
 
 
 def run(arguments: Calibrate) -> dict[str, Any]:
-    """Calibrate the map, and print what is stored in it."""
+    """Calibrate the map, and print what is stored in it; return that for --json."""
     refuse_without("--verify", arguments.verify, matcher=arguments.matcher)
     verify = None
     if arguments.verify is not None:

@@ -1,4 +1,4 @@
-"""Helpers of several commands: terminal output, and loading the model that flags name."""
+"""Helpers that several commands share: terminal output, and loading the model that flags name."""
 
 import dataclasses
 import json
@@ -48,9 +48,9 @@ def echo(line: str) -> None:
 
 
 def show(table: rich.table.Table) -> None:
-    """Print a table without wrapping; a wide one in parts, each with the first column.
+    """Print a table without wrapping; split a wide one into parts, each with the first column.
 
-    The terminal still wraps a column that is wider than itself.
+    The terminal still wraps a column that is wider than the terminal.
     """
     if table.title:
         echo(str(table.title))
@@ -89,13 +89,13 @@ STDOUT = pathlib.Path("-")
 
 
 def prepare_output(flags: Any) -> None:
-    """Check everything that a command will write, before any work.
+    """Check that a command's outputs can be written, before it does any work.
 
-    If --json or --latex is `STDOUT`, print everything else on stderr.
+    If --json or --latex is `STDOUT`, everything else is printed on stderr from then on.
 
     Raises:
-        InputError: a file or folder cannot be made, its suffix is of another format, or both
-            flags are `STDOUT`.
+        InputError: a file or folder cannot be made, a file's suffix is of another format, or both
+            --json and --latex are `STDOUT`.
     """
     printed = [name for name in ("json", "latex") if getattr(flags, name, None) == STDOUT]
     require(len(printed) < 2, "--latex: found - with --json -, expected only one of the two")
@@ -111,14 +111,14 @@ def prepare_output(flags: Any) -> None:
 
 
 class Jax:
-    """JAX's set-up for a command."""
+    """The set-up of JAX for a command."""
 
     keeps_programs: ClassVar[bool] = False
-    """Whether compiled programs are stored; see `executable_cache.cache_executables`."""
+    """Whether to store compiled programs; see `executable_cache.cache_executables`."""
 
     @classmethod
     def set_up(cls) -> None:
-        """Set up devices and caches, as `compiler.set_up` does."""
+        """Set up devices and caches, as `compiler.set_up` does, but without starting a device."""
         from crisalad_jax.utils import compiler, executable_cache
 
         compiler.configure()
@@ -127,7 +127,7 @@ class Jax:
 
 
 def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
-    """Write a command's result as JSON, or print it if the file is `STDOUT`; None does neither.
+    """Write a command's result as JSON, or print it if `file` is `STDOUT`; do neither if None.
 
     Raises:
         InputError: the file cannot be written.
@@ -139,14 +139,14 @@ def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
 
 
 def show_tables(*tables: Table, latex: pathlib.Path | None = None) -> None:
-    """Print tables, and write them as LaTeX if asked for."""
+    """Print tables, and pass them to `emit_latex`, with `latex` as the file."""
     for table in tables:
         show(table.terminal())
     emit_latex(latex, *tables)
 
 
 def emit_latex(file: pathlib.Path | None, *tables: Table) -> None:
-    """Write tables as LaTeX, or print them if the file is `STDOUT`; None does neither.
+    """Write tables as LaTeX, or print them if `file` is `STDOUT`; do neither if None.
 
     Raises:
         InputError: the file cannot be written.
@@ -159,28 +159,28 @@ def emit_latex(file: pathlib.Path | None, *tables: Table) -> None:
 
 
 def first_of(names: Sequence[str]) -> str:
-    """Quote the first of some names, for a message that states their number."""
+    """Return "'NAME' the first", to end a message that counts some names; "" without names."""
     return f"{names[0]!r} the first" if names else ""
 
 
 def pick(flags: Any, *names: str) -> dict[str, Any]:
-    """Return some flags by name, for a function whose arguments have the same names."""
+    """Return the values of some flags by name, for a function with arguments of the same names."""
     return {name: getattr(flags, name) for name in names}
 
 
 def refuse_with(flag: str, **others: Any) -> None:
-    """Raise InputError if one of the other flags, which exclude `flag`, has a value."""
+    """Raise InputError if one of `others`, values of flags that exclude `flag`, is given."""
     for name in _given(others):
         raise InputError(f"{name}: found with {flag}, expected only one of the two")
 
 
 def refuse_without(flag: str, value: Any, **others: Any) -> None:
-    """Raise InputError if one of the other flags, which need `flag`, has a value without it.
+    """Raise InputError if a flag that needs another flag is given without it.
 
     Args:
-        flag: its name.
-        value: its value.
-        **others: the values of flags that need it.
+        flag: name of the other flag, such as "--verify".
+        value: value of the other flag; None if it is not given.
+        **others: values, by name, of the flags that need it.
     """
     for name in _given(others) if value is None else ():
         raise InputError(f"{name}: found without {flag}, expected both")
@@ -210,18 +210,18 @@ def fit_words(result: "FitResult", config: "TrainConfig") -> str:
 def find_given(
     weights: pathlib.Path | None, *, runtime: QueryRuntimeName = "jax", quiet: bool = False
 ) -> pathlib.Path | None:
-    """Return the file that an optional flag names, as `find_weights` does; None if not given.
+    """Return the file for an optional flag, as `find_weights` finds it; None if not given.
 
-    For another runtime, a folder is an exported model.
+    For a runtime other than "jax", it may be the folder of an exported model.
     """
     return None if weights is None else find_weights(weights, engine=runtime, quiet=quiet)
 
 
 def given_positions(flags: PositionFlags) -> "Track | pathlib.Path | None":
-    """Return the positions that flags give, in the form that the library takes.
+    """Return --positions in the form that the library takes: a file, or a track with its times.
 
     Raises:
-        InputError: a time without positions; or what `read_track` raises.
+        InputError: a time is given without --positions, or the track cannot be read.
     """
     start, offset = flags.start_time, flags.time_offset
     refuse_without("--positions", flags.positions, start_time=start, time_offset=offset)
@@ -233,10 +233,10 @@ def given_positions(flags: PositionFlags) -> "Track | pathlib.Path | None":
 
 
 def open_set(flags: Any) -> "Benchmark":
-    """Open the evaluation set that `SetFlags` and `ReadFlags` name, and print what it is.
+    """Open the evaluation set that `SetFlags` and `ReadFlags` name, and print its size and rule.
 
     Raises:
-        InputError: what `open_benchmark` raises.
+        InputError: the set cannot be read, or the flags do not fit it.
     """
     from crisalad_jax.data.benchmarks import open_benchmark
 
@@ -250,10 +250,10 @@ def open_set(flags: Any) -> "Benchmark":
 
 
 def load_model(weights: pathlib.Path, flags: SizeFlags, *, quiet: bool = False) -> "Model":
-    """Load a JAX model by its file or name, and apply flags to it.
+    """Load a model in JAX by its file or name, and apply `flags` to its configuration.
 
     Raises:
-        InputError: what `load_weights` and `ModelConfig.resized` raise.
+        InputError: the model cannot be found or loaded, or the flags do not fit it.
     """
     from crisalad_jax.checkpoints.weights import load_weights
 
@@ -273,11 +273,11 @@ def open_flagged(
     Args:
         flags: which model, and how it describes images.
         weights: a file in place of --weights.
-        groupings: groupings of the images.
-        like: configuration of a map, whose image size and types the flags then change.
+        groupings: all groupings under which the model will describe images.
+        like: a map's configuration, whose image size, resize and types the flags then change.
 
     Raises:
-        InputError: what `open_model` and `ModelConfig.resized` raise.
+        InputError: the model cannot be found or opened, or the flags do not fit it.
     """
     return open_model(
         weights or flags.weights,

@@ -26,21 +26,21 @@ class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     preset: str = "b14"
     """Model size: tiny, s14, b14, l14 or g14."""
     seeds: int = 3
-    """Runs of each method, with seeds 0, 1 and so on."""
+    """Number of runs of each method, with seeds 0, 1 and so on."""
     epochs: int | None = None
-    """Epochs; by default as the recipes say, or 6 from scratch."""
+    """Number of epochs; by default as the recipes say, or 6 from scratch."""
     grouping: str = "single"
     """Groupings for methods with a cross-image encoder, comma-separated as in `evaluate`."""
     reference: str | None = None
     """Row that differences, speeds and training times are relative to; by default crisalad, or the
     first if that is not compared."""
     jobs: int | None = None
-    """Parallel runs, each a Ray task (extra ray) with its share of the devices; without --cluster
-    on this machine. By default 1; on a cluster one per GPU, or per node without GPUs."""
+    """Number of parallel runs, each a Ray task (extra ray) with its share of the devices, on this
+    machine or --cluster. By default 1; on a cluster one per GPU, or per node without GPUs."""
 
 
 def names_of(text: str) -> tuple[str, ...]:
-    """Split text at commas into names."""
+    """Split text at commas into names, without the spaces around them."""
     return tuple(name.strip() for name in text.split(","))
 
 
@@ -55,8 +55,8 @@ def run_comparison(
     Args:
         flags: the flags that both commands share.
         command: "compare" or "ablate".
-        names: what is compared.
-        **more: settings of the `ComparisonConfig` that only one command has.
+        names: names of the methods or rows to compare.
+        **more: settings of `ComparisonConfig` that only one of the two commands has.
 
     Returns:
         The result as JSON values.
@@ -93,8 +93,8 @@ class Compare(ComparisonFlags):
     """Train or load the paper's Table 1 methods, evaluate them the same way, and print tables."""
 
     methods: str | None = None
-    """Comma-separated. By default the models of --weights; without them, or if each is named as a
-    method, those of Table 1 over one backbone: crisalad+netvlad (or gem, conv-ap, patch-netvlad,
+    """Comma-separated. By default the models of --weights; without --weights, or if it names only
+    methods, those of Table 1 over one backbone: crisalad+netvlad (or gem, conv-ap, patch-netvlad,
     transvpr, mixvpr: that head with CriSALAD's backbone and training), cosplace-vit,
     eigenplaces-vit, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is a method too,
     and so is RECIPE+PART, with a registered part as NAME or KIND:NAME."""
@@ -107,7 +107,7 @@ class Compare(ComparisonFlags):
 
 
 def run(arguments: Compare) -> dict[str, Any]:
-    """Compare the methods, and print the tables."""
+    """Compare the methods, and print the tables; return the result for --json."""
     from crisalad_jax.experiments.comparison import names_to_compare
 
     methods = None if arguments.methods is None else names_of(arguments.methods)

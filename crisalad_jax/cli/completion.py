@@ -28,9 +28,9 @@ def run(arguments: Completion) -> None:
 
 
 def completion_script(shell: Shell) -> str:
-    """Write the script, which contains all completions, so that completing starts no Python.
+    """Return a completion script, which contains all completions and so never starts Python.
 
-    Configuration flags are those of the default parts. If the extra of a command is not
+    Configuration flags are those of the default parts. If an extra that a command needs is not
     installed, only the command's name is completed.
     """
     import shtab

@@ -15,8 +15,8 @@ from crisalad_jax.training.summary import model_words
 
 _SOURCES = f"{', '.join(each.holds for each in FORMATS.values())}, or a file of this package."
 _FORMATS = (
-    f"{', '.join(FORMATS)}, for a source of this package; by default the one its parts came from "
-    "(huggingface if the target is a .safetensors)."
+    f"{', '.join(FORMATS)}, for a source of this package; by default the first that can hold "
+    "the model in a file with the target's ending."
 )
 
 
@@ -27,25 +27,25 @@ class Convert(PluginFlag, JsonFlag):
         tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC", help=_SOURCES)
     ]
     target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST"), Target()]
-    """A .safetensors file; for a source of this package, the public checkpoint to write."""
+    """File to write: .safetensors, or for a source of this package a public checkpoint."""
     format: Annotated[str | None, tyro.conf.arg(help=_FORMATS)] = None
     backbone: pathlib.Path | None = None
-    """The backbone's checkpoint, or a published model's name, as in dinov2-vitg14: for a vocabulary
-    of AnyLoc, which is a single tensor."""
+    """For a vocabulary of AnyLoc, which is a single tensor: checkpoint of its backbone, or a
+    published model's name, as in dinov2-vitg14."""
     layer: int | None = None
-    """With --backbone: the vocabulary's block, from 0, or from the end if negative; by default -9,
-    which is 31 of ViT-g's 40."""
+    """With --backbone: the block that AnyLoc reads, from 0, or from the end if negative; by default
+    -9, which is 31 of ViT-g's 40."""
     facet: str | None = None
-    """With --backbone: query, key, value or token; by default value."""
+    """With --backbone: what AnyLoc reads: query, key, value or token; by default value."""
     assignment: str | None = None
-    """With --backbone: cosine, as published, or euclidean."""
+    """With --backbone: how the nearest word is found: cosine, as published, or euclidean."""
     half: bool = False
     """Write a file of this package in half precision, in half the space; also from a source of this
     package."""
 
 
 def run(arguments: Convert) -> dict[str, Any]:
-    """Convert the file, and print both formats and the model."""
+    """Convert the file, and print both formats and the model; return them for --json."""
     source, target, backbone = arguments.source, arguments.target, arguments.backbone
     given = pick(arguments, "layer", "facet", "assignment")
     fields = {name: value for name, value in given.items() if value is not None}

@@ -20,7 +20,7 @@ from crisalad_jax.utils.errors import few
 
 
 class Data(TableFlags, QuietFlag):
-    """List public data sets, download one, or check what a folder is and whether it is complete."""
+    """List public data sets, download one, or check which one a folder holds and what it lacks."""
 
     action: Annotated[
         tyro.conf.Positional[Literal["list", "fetch", "check"]],
@@ -33,13 +33,13 @@ class Data(TableFlags, QuietFlag):
     to: Annotated[pathlib.Path | None, NEW_FOLDER] = None
     """With fetch: new folder for the set, which `crisalad evaluate --data` then reads."""
     set: str | None = None
-    """With check: name of the expected set; by default the one in the folder's name, or any."""
+    """With check: name of the expected set; by default the one in the folder's name, else any."""
     read: bool = True
     """With check: decode all images; --no-read only counts them."""
 
 
 def run(arguments: Data) -> dict[str, Any] | None:
-    """List, fetch or check."""
+    """List the sets, fetch one, or check a folder; return what is still to write for --json."""
     if arguments.action != "fetch":
         refuse_with(f"data {arguments.action}", to=arguments.to)
     if arguments.action != "check":

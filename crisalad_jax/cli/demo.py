@@ -18,7 +18,7 @@ class Demo(TableFlags, QuietFlag):
 
 
 def run(arguments: Demo) -> dict[str, Any]:
-    """Run the demo, and print its table."""
+    """Run the demo, and print its table; return the result for --json."""
     from crisalad_jax.experiments.demo import GROUPINGS, DemoConfig, run_demo
     from crisalad_jax.experiments.report import recall_table
 

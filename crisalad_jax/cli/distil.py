@@ -23,34 +23,35 @@ class Distil(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
 
     teacher: pathlib.Path
     """Model to learn from: a file, starter, or a published model's name. It describes the images
-    once, at its own image size; its descriptors are cached for other students."""
+    once, at its own image size; its descriptors are cached, also for other students."""
     student: str
     """Model to train: tiny, s14, b14, l14 or g14, whose parts other flags replace, as in
     --model.backbone resnet --model.backbone.layers 18 --model.backbone.width 32; or weights to
-    start from."""
+    start from, a file or a name."""
     out: Annotated[pathlib.Path, FOLDER]
     """Folder of the run."""
     settings: Any
     images: tuple[pathlib.Path, ...] = ()
     """Folders of any images, or other sources (docs/how-to/image-sources.md); no labels needed."""
     data: pathlib.Path | None = None
-    """Labelled places instead of --images, one set as `train` reads it; --loss.kind.labels is the
-    weight of their labels."""
+    """Labelled places instead of --images: a set of places as `train` reads it; --loss.kind.labels
+    is the weight of the labels."""
     val: pathlib.Path | None = None
-    """Evaluation set for early stopping, in any layout that `evaluate` reads."""
+    """Evaluation set for validations, which select the best weights and, with --patience, stop
+    early; in any layout that `evaluate` reads."""
     val_images: pathlib.Path | None = None
-    """Folder of images that a .mat file or .npy lists at --val name; by default next to them."""
+    """With a .mat file or .npy lists as --val: folder of their images; by default next to them."""
     image_size: tuple[int, int] | None = None
     """Image height and width of the student; replaces --model.image-size."""
     callback: tuple[str, ...] = ()
-    """Also log steps and validations elsewhere, as `train` does."""
+    """Also log steps and validations elsewhere, as with `train --callback`."""
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
-    """Find the weights of --student, whose model determines the flags, and pass on their file.
+    """Return the arguments, with a name as --student made a path: the model determines flags.
 
     Raises:
-        InputError: what `find_weights` and `read_model` raise.
+        InputError: the weights cannot be found or read.
     """
     student = find_flag(arguments, "--student")
     if student is None or student in PRESETS or asked_for(arguments):
@@ -62,7 +63,7 @@ def prepare(arguments: Sequence[str]) -> Sequence[str]:
 
 
 def parse(program: str, arguments: Sequence[str]) -> Distil:
-    """Parse the flags, with one for every field of the configuration and of its parts."""
+    """Parse the flags, which include one for every field of the configuration and its parts."""
     return parse_settings(Distil, program, arguments, *defaults(arguments))
 
 
@@ -72,7 +73,7 @@ def command(arguments: Sequence[str]) -> type:
 
 
 def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
-    """Return the configuration that flags start from, and the preset that sizes its parts."""
+    """Return the configuration that the flags change, and the name of the preset for its parts."""
     student = find_flag(arguments, "--student") or "b14"
     preset = student if student in PRESETS else "b14"
     model = read_model(student) if os.path.isfile(student) else None
@@ -84,7 +85,7 @@ def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
 
 
 def run(arguments: Distil) -> dict[str, Any]:
-    """Train the student, and print how the run ended."""
+    """Train the student, and print how the run ended; return the result for --json."""
     from crisalad_jax.experiments.distil import distil
 
     config: TrainConfig = arguments.settings

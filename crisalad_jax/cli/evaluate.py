@@ -33,13 +33,13 @@ from crisalad_jax.utils.locks import staged_folder
 
 
 class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
-    """Print a model's recall on an evaluation set under each grouping, and how much each leaks."""
+    """Print a model's recall under each grouping, and how much its batches reveal about places."""
 
     preset: str | None = None
     """Evaluate an untrained model of this size instead of weights: tiny, s14, b14, l14 or g14."""
     grouping: str = ",".join(DEFAULT_GROUPINGS)
     """Comma-separated: single, shuffled, sequential, masked (sequential, but no image sees another
-    of its own place), window (an image with those just before it, --batch-size in all);
+    of its own place), window (an image and those just before it, --batch-size in all);
     QUERIES/DATABASE groups the sides separately, and @26 after it makes batches of 26.
     published:sage, published:cricavpr or published:crisalad: the batches of that evaluation, and
     then single, shuffled and masked ones of that size."""
@@ -55,13 +55,13 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     (docs/methods.md); local, with SIFT (docs/verification.md). Adds a row for each row of the
     table."""
     rerank_weights: pathlib.Path | None = None
-    """Model that makes these features, as --weights; by default the first stage's. For local, a
-    matcher as an ONNX file."""
+    """Model that makes the features for --rerank, as --weights; by default the first stage's. For
+    local, a matcher as an ONNX file."""
     precision: float | None = None
     """Also print the minimum similarity at which this share of the accepted first retrievals is
     correct, such as 0.99, and the remaining recall."""
     seed: int = 0
-    """Seed of the first shuffled order and untrained weights."""
+    """Seed of the first shuffled order, and of untrained weights."""
     seeds: int = 3
     """Number of shuffled orders, whose mean and standard deviation are shown."""
     out: Annotated[pathlib.Path | None, FOLDER] = None
@@ -69,7 +69,7 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     report: Annotated[pathlib.Path | None, FOLDER] = None
     """Folder for a self-contained page of all results, index.html, and its pictures as files."""
     rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
-    """Recording for the viewer Rerun: queries, retrievals, similarities; correct ones in green."""
+    """Recording for the viewer Rerun: queries, retrievals (correct ones in green), similarities."""
 
 
 def run(arguments: Evaluate) -> None:

@@ -24,27 +24,27 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
     """stablehlo, for JAX; onnx, for onnxruntime, TensorRT and others; or openvino. The last two are
     run once, and compared with this package (docs/export.md)."""
     batch_size: int | Literal["symbolic"] = "symbolic"
-    """Images per call, or symbolic for any number."""
+    """Number of images per call, or symbolic for any number."""
     grouping: Literal["single", "batch", "any"] = "single"
     """single describes every image independently, batch lets a call's images attend to each other;
     any writes two programs of onnx or openvino, and a mask says which images attend to which."""
     weights_inside: bool = False
     """Store the weights as constants in the program, not in a file next to it."""
     pixels: Literal["bytes", "floats"] | None = None
-    """Bytes, which the program normalises, or normalised floats; by default what the model
-    resizes."""
+    """Type of the input images: bytes, which the program normalises, or normalised floats; by
+    default the type that the model resizes."""
     for_colmap: bool = False
-    """For onnx: the inputs and outputs of COLMAP's draft of retrieval by global descriptors
+    """For onnx: use the inputs and outputs of COLMAP's draft of retrieval by global descriptors
     (docs/export.md)."""
     int8: pathlib.Path | None = None
-    """For onnx or openvino: photographs for quantising matrix products, a folder or other source of
-    a few dozen typical ones (one per second of a video). Costs recall (docs/export.md)."""
+    """For onnx or openvino: quantise matrix products with these photographs, a folder or other
+    source of a few dozen typical ones (one a second of a video). Costs recall (docs/export.md)."""
     platforms: str | None = None
-    """For stablehlo, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
+    """For stablehlo: platforms, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
 
 
 def run(arguments: Export) -> dict[str, Any]:
-    """Export the model, and print what was written."""
+    """Export the model, and print what was written; return that for --json."""
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
 
     require(
@@ -84,7 +84,7 @@ _MOST = 256
 
 
 def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray":
-    """Read some photographs, evenly spread over all, and prepare them for the model."""
+    """Read up to 256 photographs, evenly spread over all; return them prepared for the model."""
     import numpy as np
 
     from crisalad_jax.data.images import read_pixels

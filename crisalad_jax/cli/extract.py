@@ -22,13 +22,13 @@ class Extract(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFl
     """Write a descriptor of every image in a folder, in sorted path order."""
 
     images: pathlib.Path
-    """Folder, searched with its subfolders; or a file, a pattern, a list, a table, a video
-    or a robot log (docs/how-to/image-sources.md)."""
+    """Folder of images, with subfolders; or a file, a pattern, a list, a table, a video or a
+    robot log (docs/how-to/image-sources.md)."""
     out: Annotated[pathlib.Path, Target()]
-    """descriptors.npy (with names in .names.txt) or features.h5 (hloc)."""
+    """File to write: .npy, with the images' names in .names.txt next to it, or .h5 for hloc."""
     grouping: str = "single"
-    """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
-    all): a cross-image model's descriptors depend on it."""
+    """single, shuffled, sequential, or window (an image and those just before it, --batch-size in
+    all). A cross-image model's descriptors depend on it."""
     seed: int = 0
     """Seed of the shuffled order."""
     root: pathlib.Path | None = None
@@ -38,7 +38,7 @@ class Extract(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFl
 
 
 def run(arguments: Extract) -> dict[str, Any]:
-    """Describe the images, and print what was written."""
+    """Describe the images, and print what was written; return that for --json."""
     out, how = arguments.out, pick(arguments, "grouping", "seed")
     check_extraction(out, cluster=arguments.cluster, **how)
     positions = given_positions(arguments)

@@ -14,11 +14,11 @@ if TYPE_CHECKING:  # commands that load no model of a file start without these
 
 RuntimeName = Literal["jax", "onnxruntime", "openvino"]
 QueryRuntimeName = Literal["auto", "jax", "onnxruntime", "openvino"]
-"""What runs a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
+"""Engine that runs a model: JAX, another (`checkpoints.engines.EngineName`), or the fastest."""
 
 
 class Target(NamedTuple):
-    """Mark of a flag that names a command's output, which is checked before any work."""
+    """Mark in the annotation of a flag that names an output, which is checked before any work."""
 
     suffixes: tuple[str, ...] = ()
     """Suffixes that the file's name may have; empty allows any."""
@@ -34,7 +34,7 @@ NEW_FOLDER = Target(check=check_new_folder)
     frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,)
 )
 class Flags:
-    """Base class of flags, whose subclasses become frozen dataclasses."""
+    """Base class of the flags of commands; subclasses become frozen dataclasses."""
 
     def __init_subclass__(cls) -> None:
         """Make the class a dataclass."""
@@ -56,7 +56,7 @@ class TableFlags(JsonFlag):
 
 
 class PluginFlag(Flags):
-    """Flag for plugins."""
+    """Flag for plug-ins."""
 
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register custom parts or models; their code is run."""
@@ -70,7 +70,7 @@ class QuietFlag(Flags):
 
 
 class DecodeFlags(PluginFlag, QuietFlag):
-    """Flags for image and batch sizes."""
+    """Flags for the largest image file, the batch size, progress and plug-ins."""
 
     max_pixels: int = 2**28
     """Maximum pixels of an image file; larger ones are not decoded."""
@@ -79,14 +79,14 @@ class DecodeFlags(PluginFlag, QuietFlag):
 
 
 class ReadFlags(DecodeFlags):
-    """Flags for reading images."""
+    """Flags for reading images, including unreadable ones."""
 
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and report it."""
 
     @property
     def reading(self) -> "Reading":
-        """These flags in the form that the library takes."""
+        """These flags as a `Reading`, which the library takes."""
         from crisalad_jax.data.reading import Reading
 
         return Reading(batch_size=self.batch_size, on_bad_image=self.on_bad_image, quiet=self.quiet)
@@ -115,12 +115,12 @@ class SizeFlags(Flags):
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's, or the map's."""
     resize: tuple[str, ...] = ()
-    """Settings that replace the model's: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round;
+    """Resize settings that replace the model's: fixed, shorter-side, longer-side or native;
+    bilinear, bicubic or area; antialias or no-antialias; bytes or floats; round;
     high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
 
     def applied_to(self, config: "ModelConfig") -> "ModelConfig":
-        """Apply these flags to the configuration of a model."""
+        """Return a model's configuration with these flags applied."""
         return config.resized(self.image_size, self.resize)
 
 
@@ -132,7 +132,7 @@ class ComputeFlags(SizeFlags):
     the effects of bfloat16."""
 
     def applied_to(self, config: "ModelConfig") -> "ModelConfig":
-        """Apply these flags to the configuration of a model."""
+        """Return a model's configuration with these flags applied."""
         if self.compute_dtype is not None:
             config = dataclasses.replace(config, compute_dtype=self.compute_dtype)
         return super().applied_to(config)
@@ -158,7 +158,7 @@ class MapFlags(Flags):
     map: pathlib.Path
     """Folder that `crisalad index` wrote."""
     weights: pathlib.Path | None = None
-    """Model that made the map, a file or a published name; by default from its recorded path."""
+    """Model that made the map: a file or a published name; by default at its recorded path."""
     checksums: bool = True
     """Check the map's descriptors, and an exported model, against their checksums; --no-checksums
     skips that for huge files."""
@@ -172,10 +172,10 @@ class PositionFlags(Flags):
     GeoJSON, or CSV of time,lat,lon. By default from a table given as --images, @UTM names, or EXIF
     data (docs/how-to/image-sources.md)."""
     start_time: str | None = None
-    """When the video began, for a track as --positions, as in 2026-05-01T12:00:00+02:00."""
+    """With a track as --positions: when the video began, as in 2026-05-01T12:00:00+02:00."""
     time_offset: float | None = None
-    """Seconds to add to images' times, for a track as --positions, as in -7200 if the camera's
-    clock is two hours ahead of UTC."""
+    """With a track as --positions: seconds to add to the times of images, as in -7200 if the
+    camera's clock is two hours ahead of UTC."""
 
 
 class PlaceFlags(PositionFlags):
@@ -205,9 +205,9 @@ class SetFlags(Flags):
     ignore_zones: bool = False
     """Compare @UTM coordinates of all zones as if on one plane, as the public tools do."""
     radius: float | None = None
-    """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
+    """Largest distance of a positive in metres; by default 25, or that of a .mat file."""
     max_heading_difference: float | None = None
-    """Largest heading difference of a positive in degrees, for raw MSLS; by default any (the
-    CriSALAD paper: 40)."""
+    """Largest heading difference of a positive in degrees, for raw MSLS; by default any (40 in the
+    CriSALAD paper)."""
     frames: int | None = None
     """Largest distance of a positive in frames, for two plain folders with matching frames."""

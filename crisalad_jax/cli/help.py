@@ -1,6 +1,6 @@
-"""The help of a command: the common flags, or all of them.
+"""The help of a command: its common flags (`--help`) or all of them (`--help-all`).
 
-commands.toml names the common ones, for `--help`, and has an example.
+commands.toml names the common flags of each command, and has an example.
 """
 
 import argparse
@@ -27,7 +27,7 @@ _ENDS = re.compile(r"[.;](?= )|$")
 
 
 def asked_for(arguments: Sequence[str]) -> str | None:
-    """Return which help the arguments ask for, `SHORT` or `ALL`; None if they ask for none."""
+    """Return the help that the arguments ask for: `SHORT`, `ALL`, or None if they ask for none."""
     if ALL in arguments:
         return ALL
     return SHORT if SHORT in arguments or "-h" in arguments else None
@@ -41,7 +41,7 @@ def class_of(name: str, module: Any, arguments: Sequence[str]) -> type:
 
 
 def flags_parser(kind: type, program: str) -> argparse.ArgumentParser:
-    """Make a command's argparse parser, whose actions describe the command's flags."""
+    """Make an argparse parser, whose actions describe the flags of the command class `kind`."""
     import tyro
 
     with warnings.catch_warnings():
@@ -52,12 +52,12 @@ def flags_parser(kind: type, program: str) -> argparse.ArgumentParser:
 
 
 def short_help(name: str, about: Mapping[str, str], kind: type) -> str:
-    """Write the help that fits a screen: usage, summary, common flags and an example.
+    """Return the help that fits a screen: usage, summary, common flags and an example.
 
     Args:
         name: the command's name.
-        about: its entry in commands.toml.
-        kind: the class that its flags are parsed into.
+        about: the command's entry in commands.toml.
+        kind: the class that the command's flags are parsed into.
     """
     actions = flags_parser(kind, f"crisalad {name}")._actions
     named = {(each.option_strings or [each.dest])[0].removeprefix("--"): each for each in actions}

@@ -30,7 +30,7 @@ class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag
     """Folder, file, pattern, list, table, video or robot log (docs/how-to/image-sources.md);
     the map names images by their paths in the folder, subfolders included."""
     out: Annotated[pathlib.Path, FOLDER]
-    """The map's folder. After a kill the same command resumes."""
+    """Folder of the map. If the command is killed, the same command resumes it."""
     position_topic: str | None = None
     """Topic of positions in a robot log, by default the only NavSatFix, else the only odometry or
     pose; none ignores positions."""
@@ -38,23 +38,23 @@ class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag
     """Take an image only if its similarity to the last one taken from its folder or video is at
     most this, such as 0.9."""
     store: str | None = None
-    """Where to store descriptors: files, in the map's folder, or milvus:URI, a file name.db or
-    http://host:port; by default as in the map, or files for a new map."""
+    """Where to store descriptors: files, in the map's folder, or milvus:URI, with a file name.db or
+    http://host:port as the URI; by default as in the map, or files for a new map."""
     dtype: Literal["float32", "float16", "bits"] | None = None
-    """Type of descriptors in files, by default the map's, or float32 in a new map; bits are their
-    signs (docs/maps.md)."""
+    """Type of descriptors in files, by default that of the map, or float32 in a new map; bits
+    stores only their signs (docs/maps.md)."""
     pca: pathlib.Path | None = None
     """Components of `crisalad pca`, for shorter descriptors; the map stores a copy for
     queries."""
     search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None
-    """Build an approximate search, and print its recall; exact removes it, and auto chooses by size
-    and memory (docs/large.md). Only Milvus has diskann."""
+    """Build an index for approximate search, and print its recall; exact removes it, auto chooses
+    by size and memory (docs/large.md). Only Milvus has diskann."""
     again: bool = False
     """Also add images that `crisalad map remove` removed."""
 
 
 def run(arguments: Index) -> dict[str, Any]:
-    """Index the images, and print what became of them."""
+    """Index the images, and print what became of them; return the counts for --json."""
     out, weights, like = arguments.out, None, None
     positions = given_positions(arguments)
     metadata = read_metadata(out)

@@ -13,7 +13,7 @@ from crisalad_jax.training.summary import model_summary, summary_json, summary_l
 
 
 class Info(SizeFlags, PluginFlag, TableFlags):
-    """Print what a model consists of: parameters, what trains, multiply-accumulates per image."""
+    """Print a model's parts: their parameters, what trains, multiply-accumulates per image."""
 
     preset: str | None = None
     """Model size: tiny, s14, b14 (the default), l14 or g14."""
@@ -22,16 +22,16 @@ class Info(SizeFlags, PluginFlag, TableFlags):
     map: pathlib.Path | None = None
     """Describe the map in this folder instead."""
     checksums: bool = False
-    """Read all of the map's descriptors, and compare them with their checksums."""
+    """With --map: read all of its descriptors, and compare them with their checksums."""
     trainable: str | None = None
     """Parameters that train, as in `train`: all, adapters,head and the like, or patterns of names;
     by default the recipe's, for a file adapters,head, or head if it has no adapter."""
     batch_size: int = 16
-    """Images that attend to each other in the cross-image encoder."""
+    """Number of images that attend to each other in the cross-image encoder."""
 
 
 def run(arguments: Info) -> dict[str, Any]:
-    """Print the table of a model or a map."""
+    """Print what a model or a map contains; return it for --json."""
     refuse_without("--map", arguments.map, checksums=arguments.checksums)
     return _model(arguments) if arguments.map is None else _map(arguments.map, arguments)
 

@@ -36,7 +36,7 @@ from crisalad_jax.utils.output import counted
 
 
 class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
-    """List what is in a map, remove, replace or move some of its images, or merge maps.
+    """List what is in a map; remove, replace or move some of its images; or merge maps.
 
     Each change is atomic, even if the process is killed (docs/how-to/correct-a-map.md).
     """
@@ -57,14 +57,14 @@ class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     names: bool = False
     """With list: also the names of the images."""
     addition: int | None = None
-    """With list and remove: only images of this addition, numbered as in `list`: what was added
-    from one folder on one day."""
+    """With list and remove: only images of this addition (what was added from one folder on one
+    day), numbered as in `list`."""
     day: str | None = None
     """With list and remove: only images that were added on this day, as YYYY-MM-DD (UTC)."""
     store: str | None = None
-    """With merge: where a new map stores them, files or milvus:URI as in `crisalad index`."""
+    """With merge: where a new map stores descriptors, files or milvus:URI as in `index`."""
     images: pathlib.Path | None = None
-    """With replace: where the changed images are, under the same names, as in `crisalad index`."""
+    """With replace: source of the changed images, under the same names, as in `crisalad index`."""
     fps: float | None = None
     """With replace: frames per second from a video, by default 1."""
 
@@ -80,12 +80,12 @@ _FLAGS = {
 
 
 def needs_jax(arguments: Map) -> bool:
-    """Return whether JAX describes images."""
+    """Return whether the command describes images with JAX."""
     return arguments.action == "replace" and arguments.runtime == "jax"
 
 
 def run(arguments: Map) -> dict[str, Any]:
-    """List or change the map."""
+    """List or change the map, and print what was found or done; return that for --json."""
     action = f"map {arguments.action}"
     others = {*itertools.chain(*_FLAGS.values())} - {*_FLAGS[arguments.action]}
     refuse_with(action, **pick(arguments, *sorted(others)))

@@ -20,11 +20,11 @@ class Models(PluginFlag, TableFlags):
     """List the models that others published, which --weights takes by name, or describe one."""
 
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None
-    """Model to describe in full."""
+    """Model whose facts are all printed."""
 
 
 def run(arguments: Models) -> dict[str, Any]:
-    """Print the table of models or the facts of one."""
+    """Print the table of models, or all facts about one; return them for --json."""
     name = arguments.name
     if name is not None:
         refuse_with("NAME", latex=arguments.latex)

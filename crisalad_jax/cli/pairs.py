@@ -16,8 +16,8 @@ from crisalad_jax.utils.output import counted
 class Pairs(ReadFlags, JsonFlag):
     """Choose pairs of images to match, for COLMAP and hloc.
 
-    Pairs are among the images of --map or of --images, for a reconstruction; or, with both, of
-    --images with those of the map, to localise them.
+    For a reconstruction, pairs are among the images of --map or of --images. With both flags, the
+    images of --images are paired with those of the map, to localise them.
     """
 
     map: pathlib.Path | None = None
@@ -31,11 +31,11 @@ class Pairs(ReadFlags, JsonFlag):
     k: int = 20
     """Pair each image with this many most similar ones; 0 makes no such pairs."""
     min_similarity: float = -1.0
-    """Minimum similarity of such pairs."""
+    """Minimum similarity of the pairs of --k."""
     min_gap: float | None = None
-    """Minimum seconds between the two images, by the times in their names: for loop closures."""
+    """Minimum seconds between images paired by --k, by the times in their names (loop closures)."""
     overlap: int = 0
-    """Also pair each image with this many next ones in its folder or video."""
+    """Also pair each image with the next images in its folder or video, up to this many."""
     within: float | None = None
     """Also pair images at most this many metres apart, if positions are known."""
     weights: pathlib.Path | None = None
@@ -50,12 +50,12 @@ class Pairs(ReadFlags, JsonFlag):
 
 
 def needs_jax(arguments: Pairs) -> bool:
-    """Return whether JAX describes images: those of a map have descriptors."""
+    """Return whether the command describes images with JAX; a map's have descriptors already."""
     return arguments.images is not None and arguments.runtime == "jax"
 
 
 def run(arguments: Pairs) -> dict[str, Any]:
-    """Choose the pairs, and write them."""
+    """Choose and write the pairs, and print how many; return the result for --json."""
     folder, images, reading = arguments.map, arguments.images, arguments.reading
     rules = pick(arguments, "k", "overlap", "within", "min_gap")
     check_rules(among=folder is None or images is None, **rules)

@@ -16,14 +16,14 @@ from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca, sh
 
 
 class Pca(JsonFlag, QuietFlag):
-    """Fit principal components, by which extract and evaluate --pca shorten descriptors."""
+    """Fit principal components, with which extract and evaluate --pca shorten descriptors."""
 
     descriptors: pathlib.Path
-    """A .npy file, such as `crisalad extract` writes; not of evaluation images."""
+    """A .npy file, such as `crisalad extract` writes, but not of evaluation images."""
     out: Annotated[pathlib.Path, WEIGHTS]
     """A .safetensors file: the components, or with --weights a model."""
     weights: str | None = None
-    """Make a model of these weights with the components as its last layer."""
+    """Write this model, a file or a name, with the components as its last layer."""
     dim: int = 512
     """Number of components."""
     whiten: bool = False
@@ -33,13 +33,13 @@ class Pca(JsonFlag, QuietFlag):
     samples: int = SAMPLES
     """Maximum number of descriptors to fit, drawn at random."""
     seed: int = 0
-    """Seed of that draw."""
+    """Seed of the draw of --samples."""
     checksums: bool = True
     """Check descriptors against their checksums; --no-checksums skips that for huge files."""
 
 
 def run(arguments: Pca) -> dict[str, Any]:
-    """Fit components, write them, and print their share of the variance."""
+    """Fit and write components, and print their share of the variance; return it for --json."""
     weights = arguments.weights
     checked = {"verify": arguments.checksums}
     model = None if weights is None else load(weights, quiet=arguments.quiet, **checked)

@@ -20,13 +20,13 @@ class Publish(JsonFlag, PluginFlag, QuietFlag):
     licence: str
     """The weights' licence, by the hub's name for it, such as apache-2.0 or cc-by-nc-4.0."""
     data: str | None = None
-    """What it was trained on, in words; by default what the run recorded."""
+    """What the model was trained on, in words; by default what the run recorded."""
     evaluation: tuple[pathlib.Path, ...] = ()
-    """Files that `crisalad evaluate --json` wrote for it, whose recalls the card shows."""
+    """Files that `crisalad evaluate --json` wrote for the model; the card shows their recalls."""
 
 
 def run(arguments: Publish) -> dict[str, Any]:
-    """Publish the model, and print where it is."""
+    """Publish the model, and print where it is; return that for --json."""
     where = publish(
         arguments.run,
         arguments.to,

@@ -56,7 +56,7 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     ]
     """Images, or folders of them, patterns, lists, tables, videos or robot logs
     (docs/how-to/image-sources.md).
-    None with --watch or --camera."""
+    Give none with --watch or --camera."""
     watch: pathlib.Path | None = None
     """Folder to watch: answer each new image as it appears, with a line of JSON."""
     camera: str | None = None
@@ -66,34 +66,34 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     fps: float | None = None
     """Frames per second from a video or log, by default 1; with --camera, the maximum to answer."""
     window: int = 1
-    """Number of frames described together: each of a moving camera with those just before it."""
+    """Number of frames described together: each frame of a moving camera and those before it."""
     runtime: QueryRuntimeName = "auto"
     """Engine that runs the model (docs/export.md); auto is the fastest that is installed and agrees
     with jax. Weights are exported for it once; --weights may be an exported folder."""
     k: int = 5
-    """Answers per query."""
+    """Number of answers per query."""
     min_similarity: float | None = None
     """Similarity of the best answer below which the place is unknown; by default what `crisalad
     calibrate` measured for this map. -1 answers every query."""
     sequence: Literal["bayes", "seqslam"] | None = None
-    """Treat the queries as consecutive frames of one camera: bayes, a filter, weighs all so
+    """Treat the queries as consecutive frames of one camera: bayes, a filter, weighs all frames so
     far; seqslam searches lines through the last ones (docs/maps.md)."""
     sequence_reach: float | None = None
-    """Largest speed of this camera relative to the map's; by default 2. If names have no times or
-    positions, in map images per frame."""
+    """For bayes: largest speed of this camera relative to the map's; by default 2. If names have no
+    times or positions, it is in map images per frame."""
     sequence_length: int | None = None
-    """Length of seqslam's lines in frames; by default 10."""
+    """For seqslam: length of its lines in frames; by default 10."""
     where: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Search only some of the map's images: 'folder=monday, added>=2026-05-01,
     box=west,south,east,north', each condition optional; also time>= (docs/maps.md)."""
     exact: bool = False
     """Search exactly, even if the map has an approximate search."""
     json: Annotated[pathlib.Path | None, Target((".json", ".jsonl"))] = None
-    """File for the answers: .jsonl, a line of JSON for each query, or .json, a list; - prints
+    """File for the answers: .jsonl, a line of JSON for each query, or .json, a list; - prints the
     lines."""
     out: Annotated[pathlib.Path | None, Target(POSITION_SUFFIXES)] = None
-    """File for the queries' positions, in the format of its suffix: .csv, which --positions takes,
-    or .geojson, .gpx or .kml, in degrees."""
+    """File for the position of each query's best answer: .csv, which --positions takes, or
+    .geojson, .gpx or .kml, in degrees."""
     gallery: Annotated[pathlib.Path | None, Target((".png", ".svg", ".pdf"))] = None
     """PNG, SVG or PDF of up to 24 queries with up to 8 answers each."""
     rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
@@ -108,22 +108,22 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     """Inliers of the best answer below which the place is unknown; by default what `crisalad
     calibrate --verify` measured for this map."""
     matcher: pathlib.Path | None = None
-    """ONNX file of features and their matcher, such as ALIKED + LightGlue; by default SIFT."""
+    """With --verify: ONNX file of features and matcher, as ALIKED + LightGlue; by default SIFT."""
     intrinsics: str | None = None
     """The camera's fx,fy,cx,cy[,width,height], or a file: YAML or JSON of ROS's camera_info."""
     map_intrinsics: str | None = None
-    """Intrinsics of the map's camera, if different."""
+    """Intrinsics of the map's camera, if they differ from --intrinsics."""
     map_depth: pathlib.Path | None = None
-    """Folder of 16-bit PNGs with the names of the map's images: their depth in millimetres."""
+    """Folder of 16-bit PNGs, named like the map's images: depth in millimetres, for --verify."""
 
 
 def needs_jax(arguments: Query) -> bool:
-    """Return whether JAX describes the images: another runtime starts without importing it."""
+    """Return whether JAX is chosen to describe images; other runtimes start without it."""
     return arguments.runtime == "jax"
 
 
 def run(arguments: Query) -> None:
-    """Query the map, and print or write its answers, also as images arrive."""
+    """Query the map, and print or write the answers: of all images, or of each as it arrives."""
     if arguments.watch is not None or arguments.camera is not None:
         _run_live(arguments)
         return
@@ -270,7 +270,7 @@ def _unknown_words(answers: Answers, places: Map) -> str:
 
 
 def answer_lines(answers: Answers) -> Iterator[str]:
-    """Yield the name of each query, and below it its answers; an unknown place has one line.
+    """Yield lines to print: each query's name, then its answers, or one line if it is unknown.
 
     Numbers are in columns, and names at the ends of lines: a name that is too long for a terminal
     wraps there, and can still be copied in one piece.

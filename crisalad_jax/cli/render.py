@@ -18,23 +18,23 @@ from crisalad_jax.utils.output import counted
 
 
 class Render(JsonFlag, QuietFlag):
-    """Render streets, rooms, countryside and more: places to train on, and others to test."""
+    """Render streets, rooms, countryside and more: places to train on, and others to test on."""
 
     out: Annotated[pathlib.Path, FOLDER]
     """Folder for the world: train/ in the layout of GSV-Cities, test/ in that of
     VPR-datasets-downloader."""
     scenes: int = WorldConfig.scenes
-    """Scenes to train on."""
+    """Number of scenes to train on."""
     stations: int = WorldConfig.stations
-    """Places per scene, one behind another; they look similar."""
+    """Number of places per scene, one behind another; they look similar."""
     images_per_place: int = WorldConfig.images_per_place
-    """Images per place; weather, light, season, traffic and viewpoint vary."""
+    """Number of images per place; weather, light, season, traffic and viewpoint vary."""
     test_scenes: int = WorldConfig.test_scenes
-    """Other scenes, to test on."""
+    """Number of other scenes, to test on."""
     image_size: tuple[int, int] = WorldConfig.image_size
-    """Height and width in pixels."""
+    """Height and width of the images in pixels."""
     sceneries: tuple[Scenery, ...] = SCENERIES
-    """Kinds of places, in turn."""
+    """Kinds of scenes, which take turns."""
     repaint: float = WorldConfig.repaint
     """Largest standard deviation of objects' log colour between images."""
     varied: tuple[Variation, ...] = VARIATIONS
@@ -47,7 +47,7 @@ class Render(JsonFlag, QuietFlag):
 
 
 def run(arguments: Render) -> dict[str, Any]:
-    """Render the world, and print what is in it."""
+    """Render the world, and print what is in it; return that for --json."""
     given = pick(arguments, *(field.name for field in dataclasses.fields(WorldConfig)))
     config = WorldConfig(**given)
     places = config.scenes * config.stations

@@ -22,7 +22,7 @@ class Serve(DecodeFlags, MapFlags):
     port: int = 8000
     """Port to listen on; 0 is any free one."""
     token_file: pathlib.Path | None = None
-    """File of the token that requests must send; by default from the variable CRISALAD_TOKEN."""
+    """File with the token that requests must send; by default the variable CRISALAD_TOKEN."""
     append: bool = False
     """Let requests add images to the map; no other process can append then."""
     map_images: pathlib.Path | None = None
@@ -30,14 +30,14 @@ class Serve(DecodeFlags, MapFlags):
     runtime: QueryRuntimeName = "auto"
     """Engine that runs the model; see `crisalad query`."""
     k: int = 5
-    """Answers per picture, if the request sets no number."""
+    """Number of answers per picture, if the request sets none."""
     tiles: str | None = None
-    """URL of street map tiles, which browsers then load behind the page's map:
+    """URL of street map tiles, which browsers load behind the page's map, as in
     https://tile.openstreetmap.org/{z}/{x}/{y}.png."""
     tiles_attribution: str | None = None
     """Text to show with the tiles; by default OpenStreetMap's, for its tiles."""
     rerank: str | None = None
-    """local:N verifies the N best answers by local features; local, the first 5
+    """local:N verifies the N best answers by local features; local alone verifies the first 5
     (docs/verification.md)."""
     max_bytes: int = 20 * 2**20
     """Maximum bytes of a request."""

@@ -59,7 +59,7 @@ def sets_table(sets: Sequence[PublishedSet]) -> Table:
 
 
 def checked_table(parts: Sequence[CheckedPart]) -> Table:
-    """Make a table of what a folder contains, with a row for each part."""
+    """Make a table of what a folder of images contains, with a row for each part of the set."""
     rows = []
     for part in parts:
         counts = [
@@ -82,7 +82,7 @@ _MOST = 10
 
 
 def fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line for each fact, and one for each of the first rows of a list of objects."""
+    """Yield lines to print for facts: one each, or one per object of a list, up to ten of them."""
     width = max(map(len, facts))
     for name, value in facts.items():
         is_table = isinstance(value, list) and all(isinstance(each, dict) for each in value)

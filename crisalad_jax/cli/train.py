@@ -48,11 +48,12 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     topic: str | None = None
     """Topic of images in a robot log as --data, by default the only one."""
     data_images: pathlib.Path | None = None
-    """Folder of images that a .mat file at --data names; by default next to it."""
+    """With a .mat file as --data: folder of its images; by default next to it."""
     val: pathlib.Path | None = None
-    """Evaluation set for early stopping, in any layout that `evaluate` reads."""
+    """Evaluation set for validations, which select the best weights and, with --patience, stop
+    early; in any layout that `evaluate` reads."""
     val_images: pathlib.Path | None = None
-    """Folder of images that a .mat file or .npy lists at --val name; by default next to them."""
+    """With a .mat file or .npy lists as --val: folder of their images; by default next to them."""
     weights: pathlib.Path | None = None
     """Weights of a model to start from: a file, starter, or a published model's name. The run has
     the file's model, preprocessing and image size, unless flags or --config say otherwise."""
@@ -60,8 +61,8 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     """Start from only this backbone: a file of this package, any checkpoint that `convert` reads,
     or a published model's name, as in dinov2-vitb14."""
     preset: str = "b14"
-    """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from. With
-    --weights it is the file's."""
+    """Size of the model, which other flags can change: tiny, s14, b14, l14 or g14. With --weights
+    it is the file's."""
     recipe: str | None = None
     """How to train. As published: crisalad (the paper; the default), crisalad-1e-4 or
     crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
@@ -82,18 +83,17 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     validations, and counted)."""
     coordinator_address: str | None = None
     """For several processes, on one host or many, which each run this command: HOST:PORT of process
-    0, or auto under Slurm, Open MPI or Kubernetes, with a process for each GPU. Only process 0
-    writes into --out."""
+    0, or auto under Slurm, Open MPI, Kubernetes or Cloud TPU. Only process 0 writes into --out."""
     num_processes: int | None = None
     """Number of processes, with --coordinator-address HOST:PORT."""
     process_id: int | None = None
-    """Number of this process, from 0."""
+    """Number of this process, from 0, with --coordinator-address HOST:PORT."""
     local_device_ids: tuple[int, ...] | None = None
     """GPUs of this host for this process, with --coordinator-address. By default one: that of the
     process's number on its host, if Slurm, Open MPI or a coordinator at localhost gives it."""
     shard_state: bool = False
-    """Shard the trainable parameters and their moments over the devices: for --trainable all of a
-    large model."""
+    """Shard the trainable parameters and the optimiser's moments over the devices: for --trainable
+    all of a large model."""
     cache_gb: float = CACHE_GB
     """Maximum gigabytes of --data at an address (s3://...) that are cached on this host's disk, in
     CRISALAD_CACHE; processes share it, and 0 caches nothing."""
@@ -106,16 +106,16 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
 
 
 def parse(program: str, arguments: Sequence[str]) -> Train:
-    """Parse the flags, with one for every field of the configuration and of its parts."""
+    """Parse the flags, which include one for every field of the configuration and its parts."""
     return parse_settings(Train, program, arguments, defaults(arguments), preset_of(arguments))
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
-    """Find the file of --weights, whose model determines the flags, and pass it on.
+    """Return the arguments, with a name as --weights made a path: the model determines flags.
 
     Raises:
-        InputError: what `find_weights` and `read_model` raise; or several processes would download
-            and convert, which uses JAX before they have joined.
+        InputError: the weights cannot be found or read; or several processes would download and
+            convert them, which uses JAX before the processes have joined.
     """
     given = find_flag(arguments, "--weights")
     if given is None or asked_for(arguments):
@@ -152,18 +152,18 @@ def command(arguments: Sequence[str]) -> type:
 
 
 def preset_of(arguments: Sequence[str]) -> str:
-    """Return the preset that sizes the parts."""
+    """Return the name of the preset that sizes the model and its parts."""
     return find_flag(arguments, "--preset") or "b14"
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
-    """Read the configuration that flags start from.
+    """Return the configuration that the flags change.
 
     It comes from --config; or from --preset and --recipe, with the model of --weights if that
-    file exists (`prepare` finds it). If --data names sets, it has settings for each.
+    file exists (`prepare` finds it). If --data names several sets, it has settings for each.
 
     Raises:
-        InputError: --config is given with one of the others, or one of them does not exist.
+        InputError: --config is given with --preset or --recipe, or what a flag names is missing.
     """
     given, data = find_flag(arguments, "--config"), flag_values(arguments, "--data")
     require(len(data) < 2, "--data: found twice, expected all sets after one: NAME=DIR NAME=DIR")
@@ -198,7 +198,7 @@ def _data(given: Sequence[str]) -> dict[str, pathlib.Path] | pathlib.Path:
 
 
 def run(arguments: Train) -> dict[str, Any] | None:
-    """Train the model, and print how the run ended."""
+    """Train the model, and print how the run ended; return the result for --json."""
     from crisalad_jax.experiments.train import train
     from crisalad_jax.training import distributed
     from crisalad_jax.training.lost import filter_aborts

@@ -13,19 +13,19 @@ class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     """Build a model's vocabulary from images: AnyLoc's, NetVLAD's, or words of SIFT or ORB."""
 
     images: pathlib.Path
-    """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
+    """Folder of images, with subfolders; or a file, a pattern, a list, a table or a video
     (docs/how-to/image-sources.md). Not evaluation images."""
     out: Annotated[pathlib.Path, WEIGHTS]
-    """A .safetensors file."""
+    """A .safetensors file, for the model with the new vocabulary."""
     weights: pathlib.Path | None = None
     """Model whose vocabulary is replaced: AnyLoc, NetVLAD or a custom part with one; a file, or a
     published model's name."""
     backbone: pathlib.Path | None = None
-    """Any checkpoint that `convert` reads, or a published model's name, as in dinov2-vitg14: its
-    backbone is used."""
+    """Any checkpoint that `convert` reads, or a published model's name, as in dinov2-vitg14; only
+    its backbone is used."""
     preset: str | None = None
-    """tiny, s14, b14 (the default), l14 or g14: the size of --backbone; without one the backbone is
-    random."""
+    """Size of the backbone: tiny, s14, b14 (the default), l14 or g14; without --backbone its
+    weights are random."""
     aggregator: str | None = None
     """With --preset: anyloc (the default), or another that starts from centroids, such as netvlad
     or a custom part; or sift-vlad, sift-bow or orb-bow, which need no backbone."""
@@ -34,7 +34,7 @@ class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     layer: int | None = None
     """Block that AnyLoc reads, from 0, or from the end if negative; by default the preset's."""
     facet: str | None = None
-    """What AnyLoc takes from that block: query, key, value or token; by default its values."""
+    """What AnyLoc takes from its block: query, key, value or token; by default value."""
     assignment: str | None = None
     """How AnyLoc finds the nearest word of a patch: cosine (as published) or euclidean."""
     max_images: int = IMAGES
@@ -44,7 +44,7 @@ class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
 
 
 def run(arguments: Vocabulary) -> dict[str, Any]:
-    """Build the vocabulary, write the model, and print its size."""
+    """Build the vocabulary, write the model, and print its size; return that for --json."""
     model = _model(arguments)
     built = build_vocabulary(
         model,

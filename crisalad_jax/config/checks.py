@@ -1,4 +1,4 @@
-"""Checks of a configuration's fields."""
+"""Checks of the fields of configurations, and of the arguments of functions."""
 
 import dataclasses
 import functools
@@ -27,7 +27,7 @@ from crisalad_jax.utils.errors import InputError
 
 _T = TypeVar("_T")
 REGISTRY = "registry"
-"""Key of a part's registry in the metadata of its field."""
+"""Key of the registry in the metadata of a dataclass field that holds a part."""
 _PLAIN: Mapping[type, tuple[str, tuple[type, ...]]] = {
     bool: ("True or False", (bool, np.bool_)),
     int: ("a whole number", (int, np.integer)),
@@ -38,10 +38,10 @@ _PLAIN: Mapping[type, tuple[str, tuple[type, ...]]] = {
 
 
 def choose(what: str, name: str, choices: Mapping[str, _T]) -> _T:
-    """Look up `name` in `choices`.
+    """Return the value of `name` in `choices`.
 
     Raises:
-        InputError: no such name; the message lists the valid ones.
+        InputError: there is no such name; the message begins with `what` and lists the valid names.
     """
     if name not in choices:
         raise InputError(f"{what}: found {name!r}, expected one of {', '.join(sorted(choices))}")
@@ -49,16 +49,16 @@ def choose(what: str, name: str, choices: Mapping[str, _T]) -> _T:
 
 
 def require(condition: bool, message: str) -> None:
-    """Raise InputError with the message unless the condition holds."""
+    """Raise InputError with `message` unless the condition holds."""
     if not condition:
         raise InputError(message)
 
 
 def check_seed(what: str, seed: int) -> None:
-    """Check a seed, as `Seed` does.
+    """Check that a seed is a whole number from 0 that fits 32 bits, as in fields of type `Seed`.
 
     Raises:
-        InputError: it is not a whole number, is negative, or has more than 32 bits.
+        InputError: the seed is anything else; the message begins with `what`.
     """
     allowed = kind_of(Seed)
     require(allowed.fits(seed), f"{what}: found {seed!r}, expected {allowed.words}")
@@ -68,7 +68,7 @@ def check_count(what: str, count: Any) -> None:
     """Check that an argument is a whole number of at least 1.
 
     Raises:
-        InputError: it is less, or not a whole number.
+        InputError: it is less, or not a whole number; the message begins with `what`.
     """
     is_whole = kind_of(int).fits(count)
     expected = "at least 1" if is_whole else "a whole number of at least 1"
@@ -76,17 +76,17 @@ def check_count(what: str, count: Any) -> None:
 
 
 PATH = (str, os.PathLike)
-"""Classes of a path of a file or folder."""
+"""Classes of an argument that is the path of a file or folder, for `takes`."""
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
-    """Make a decorator that checks the classes of a public function's arguments.
+    """Return a decorator that checks the classes of a function's arguments at each call.
 
-    Swapped arguments then give a one-line error, not an AttributeError deep inside a call.
+    Swapped arguments then raise a one-line InputError, not an AttributeError deep inside the call.
 
     Args:
-        **kinds: the class, or the classes, of an argument by its name.
+        **kinds: for each argument to check, by name, the class or classes that it may have.
 
     Returns:
         The decorator.
@@ -128,10 +128,10 @@ def check_types(config: Any) -> None:
     left to `resolve_names`, and types that configurations do not use are not checked.
 
     Args:
-        config: the configuration, a dataclass that is being made.
+        config: the configuration, a dataclass, which calls this in its `__post_init__`.
 
     Raises:
-        InputError: naming the class and the first field that does not.
+        InputError: a field holds a value of another type; the message names its class and field.
 
     Example:
         >>> from crisalad_jax import CrossImageConfig
@@ -159,13 +159,13 @@ class Kind(NamedTuple):
     """The values that a type hint allows."""
 
     fits: Callable[[Any], bool]
-    """Returns whether a value is of the type."""
+    """Function that returns whether a value is allowed."""
     words: str
-    """The type, for a message."""
+    """Description of the allowed values, for messages."""
 
 
 def limited(least: float, most: float = math.inf) -> Kind:
-    """Return a range, both ends included, for the annotation of a number."""
+    """Return the kind of numbers in a range, both ends included, for use in `Annotated`."""
     words = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
     return Kind(lambda value: least <= value <= most, words)
 
@@ -187,7 +187,7 @@ Fraction = Annotated[
 
 @functools.cache
 def kind_of(hint: Any) -> Kind:
-    """Return the values that a type hint allows."""
+    """Return the `Kind` of values that a type hint allows."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         plain, limited = kind_of(arguments[0]), arguments[1]
@@ -222,12 +222,12 @@ def kind_of(hint: Any) -> Kind:
 
 
 def require_field(config: object, name: str, holds: bool, expected: str) -> None:
-    """Check a field of a configuration; the message says what was expected of it."""
+    """Raise InputError unless `holds`, with the field `name`, its value and what is `expected`."""
     found = getattr(config, name)
     require(holds, f"{type(config).__name__}.{name}: found {found!r}, expected {expected}")
 
 
 def require_range(config: object, least: float, most: float, name: str) -> None:
-    """Check a field against a range, both ends included, that depends on other settings."""
+    """Raise InputError unless the field `name` is in a range, both ends included."""
     allowed = limited(least, most)
     require_field(config, name, allowed.fits(getattr(config, name)), allowed.words)

@@ -10,7 +10,7 @@ from crisalad_jax.config.short_repr import short_repr
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class ClassesConfig:
-    """How images form classes, and classes form groups, on which epochs train in turn.
+    """How images form classes, and classes form groups that epochs train on in turn.
 
     The constants are CosPlace's (Berton et al., CVPR 2022); see docs/methods.md.
 
@@ -23,17 +23,17 @@ class ClassesConfig:
     """Kind of class: the training set's places, CosPlace's cells of position and heading, or
     EigenPlaces' cells of position with a focal point. The latter two need real positions."""
     groups: PositiveInt = 8
-    """Number of groups to train on, those with the most classes; for viewpoints, this many lateral
-    and this many frontal groups."""
+    """Number of groups to train on: those with the most classes. Viewpoints have this many lateral
+    groups, and as many frontal ones."""
     steps: PositiveInt | None = None
-    """Number of steps in an epoch; None passes once over the largest group."""
+    """Number of steps in an epoch; None takes as many as one pass over the largest group."""
     cell: PositiveFloat = 10.0
     """Side of a cell in metres, CosPlace's M; EigenPlaces' is 15."""
     sector: PositiveFloat = 30.0
     """Width of a sector of headings in degrees, CosPlace's alpha."""
     spacing: PositiveInt = 5
     """Distance in cells between neighbouring classes of a group, CosPlace's N; EigenPlaces' is 3.
-    Places of a group are not `Places.near` each other; if that is None, over N - 1 cells apart."""
+    Places of a group are not marked as near each other; without marks, over N - 1 cells apart."""
     sector_spacing: PositiveInt = 2
     """Distance in sectors between neighbouring classes of a group, CosPlace's L."""
     focal_distance: PositiveFloat = 10.0

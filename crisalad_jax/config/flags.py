@@ -27,14 +27,14 @@ _KIND = "_kind"
 def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "") -> Any:
     """Make a stand-in for a configuration, with the same fields and values but without checks.
 
-    tyro makes a flag for every field of its class. Parts that the arguments name replace those of
-    the configuration, so that there are flags for their fields.
+    tyro makes a flag for every field of the stand-in's class. Parts that the arguments name replace
+    those of the configuration, so that there are flags for their fields.
 
     Args:
         config: the configuration.
-        arguments: the command line's arguments.
-        preset: preset of sizes for the model and its parts.
-        path: dotted name of this configuration's own flag.
+        arguments: the arguments of the command line.
+        preset: name of the preset that sizes the model and its parts, such as "b14".
+        path: dotted name of the configuration's own flag; empty for the outermost configuration.
 
     Raises:
         InputError: the arguments name an unknown part.
@@ -80,10 +80,10 @@ def _flags_of_each(configs: Sequence[Any], arguments: Sequence[str], preset: str
 
 
 def config_of(flags: Any) -> Any:
-    """Make the configuration from a parsed stand-in of `flags_of`.
+    """Make the configuration from a stand-in of `flags_of` that tyro has filled in.
 
     Raises:
-        InputError: what the configuration's own checks raise.
+        InputError: the configuration's own checks reject a value.
     """
     kind = getattr(flags, _KIND)
     fields = dataclasses.fields(flags if kind is tuple else kind)
@@ -95,7 +95,7 @@ def config_of(flags: Any) -> Any:
 
 
 def flag_values(arguments: Sequence[str], name: str) -> list[list[str]]:
-    """List the values of each occurrence of a flag, as FLAG VALUE ... or FLAG=VALUE."""
+    """List the values of each occurrence of a flag, given as FLAG VALUE ... or FLAG=VALUE."""
     found = []
     for place, argument in enumerate(arguments, 1):
         flag, equals, value = argument.partition("=")
@@ -121,14 +121,14 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
     Args:
         config: the configuration to change.
         arguments: flags and values as on a command line; booleans are True or False.
-        preset: preset of sizes for the model and its parts.
-        what: beginning of messages.
+        preset: name of the preset that sizes the model and its parts, such as "b14".
+        what: text with which error messages begin.
 
     Returns:
         A configuration of the same class.
 
     Raises:
-        InputError: no such flag or part, or a value that does not fit; one line.
+        InputError: there is no such flag or part, or a value does not fit; the message is one line.
     """
     with locate_errors(f"{what}: "), refusals(arguments):
         default = flags_of(config, arguments, preset)
@@ -148,14 +148,14 @@ _WIDE = "100000"
 
 @contextlib.contextmanager
 def refusals(arguments: Sequence[str], *, wide: bool = True) -> Iterator[None]:
-    """Raise an InputError for the error that tyro prints in a box before it ends the program.
+    """Raise an InputError in place of the box with which tyro reports an error and exits.
 
     Args:
-        arguments: the command line's arguments, to find the flag of a value.
-        wide: whether the block prints nothing but a box; a help text must fit the terminal.
+        arguments: the arguments of the command line, to find the flag of a value.
+        wide: whether to let tyro print wider than the terminal; False if it may print a help text.
 
     Raises:
-        InputError: one line; or the one that a configuration's own check raised.
+        InputError: tyro's error in one line, or the error of a configuration's own check.
     """
     box, columns = io.StringIO(), os.environ.get("COLUMNS")
     if wide:
@@ -197,7 +197,7 @@ def _unboxed(box: str) -> list[str]:
 
 
 def plain_metavar(text: str) -> str:
-    """Rewrite tyro's placeholder for a flag's value in our style, without the None choice."""
+    """Rewrite tyro's placeholder for a flag's value in a plainer style, without the None choice."""
     text = text.replace("{None}|", "").replace("{None,", "{")
     text = re.sub(r"\[(\w+) \[\1 \.\.\.\]\]|(\w+) \[\2 \.\.\.\]", r"\1\2...", text)
     return re.sub(r"^\{(\w+ .*|\w+\.\.\.)\}$", r"\1", text)
@@ -283,18 +283,18 @@ def parse_settings(
     """Parse a command's flags, with one for every field of a configuration and of its parts.
 
     Args:
-        kind: the command's class, whose subclasses become dataclasses. Its field `settings` takes
-            the configuration, and a field `image_size`, if there is one, replaces the model's.
+        kind: the command's class (`cli.flags.Flags`). Its field `settings` takes the configuration,
+            and a field `image_size`, if there is one, replaces the model's.
         program: the command's name, for messages.
-        arguments: the command line's arguments.
-        defaults: the configuration that flags start from.
-        preset: preset of sizes for the model and its parts.
+        arguments: the arguments of the command line.
+        defaults: the configuration that the flags change.
+        preset: name of the preset that sizes the model and its parts, such as "b14".
 
     Returns:
-        An instance of `kind`.
+        An instance of a subclass of `kind`.
 
     Raises:
-        InputError: no such part, or what the configuration's checks raise.
+        InputError: there is no such part, or the configuration's checks reject a value.
     """
     parsed: Any = tyro.cli(
         with_settings(kind, arguments, defaults, preset), prog=program, args=arguments
@@ -312,7 +312,7 @@ def with_settings(kind: type, arguments: Sequence[str], defaults: Any, preset: s
     """Make a command's class with a flag for every field of a configuration; see `parse_settings`.
 
     Raises:
-        InputError: no such part.
+        InputError: the arguments name an unknown part.
     """
     default = flags_of(defaults, arguments, preset)
     hint = Annotated[type(default), tyro.conf.arg(name="")]

@@ -23,12 +23,12 @@ PLUGIN = "plugin"
 
 
 def to_plain(config: Any) -> Any:
-    """Convert a configuration to nested dictionaries of JSON values, with its parts' names.
+    """Convert a configuration to nested dictionaries of JSON values, with the names of its parts.
 
-    A part of a plug-in also has the plug-in's name, so that messages can name a missing plug-in.
+    Plug-ins' parts also have the plug-in's name, so that messages can name a missing plug-in.
 
     Raises:
-        InputError: a value is not a number, text or a list of these.
+        InputError: a value is not None, a number, text or a list of these.
     """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
         fields = {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
@@ -45,18 +45,18 @@ def to_plain(config: Any) -> Any:
 
 
 def from_plain(kind: type[_T], value: Any, *, source: str) -> _T:
-    """Make the configuration of class `kind` from the values that `to_plain` returned.
+    """Make a configuration of class `kind` from values like those that `to_plain` returns.
 
     Missing fields take their defaults.
 
     Args:
         kind: the class.
         value: JSON values.
-        source: what messages begin with, such as a file's name.
+        source: text with which error messages begin, such as a file's name.
 
     Raises:
-        InputError: naming `source`, and an unknown field, a part that is not registered, or a value
-            that does not fit.
+        InputError: a field is unknown or missing, a part is not registered, or a value does not
+            fit; the message names it.
     """
     with locate_errors(f"{source}: "):
         return _config(kind, value, "config")
@@ -114,8 +114,8 @@ def read_config(kind: type[_T], path: pathlib.Path) -> _T:
     """Read a configuration that a run wrote, or that a user wrote without a checksum.
 
     Args:
-        kind: its class.
-        path: the file.
+        kind: class of the configuration.
+        path: the JSON file.
 
     Raises:
         InputError: the file is missing, is not JSON, was changed since it was written, or holds
@@ -129,9 +129,9 @@ def read_config(kind: type[_T], path: pathlib.Path) -> _T:
 
 
 def differences(found: Any, expected: Any, prefix: str = "") -> list[str]:
-    """Return the fields in which two configurations differ, as `name: found, expected`.
+    """List the fields in which two configurations differ, as "NAME: found A, expected B".
 
-    Fields that one of them does not use do not count.
+    Fields that one of the two does not use are ignored. Names begin with `prefix` and a dot.
     """
     if dataclasses.is_dataclass(found) and type(found) is type(expected):
         fields = min(fields_in_use(found), fields_in_use(expected), key=len)

@@ -22,13 +22,13 @@ _NON_SEMANTIC = "non-semantic"
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """Base class of everything that can be swapped without changing this package.
+    """Base class of parts, which can be replaced without changing this package.
 
     Registering a subclass makes it a frozen dataclass.
     """
 
     registry: ClassVar[Any]
-    """The `Registry` of its kind."""
+    """The `Registry` of this kind of part."""
     part_name: ClassVar[str]
 
     def __post_init__(self) -> None:
@@ -101,16 +101,16 @@ def parts_of(config: Any, prefix: str = "") -> dict[str, Part]:
 
 
 def non_semantic_field(default: _T) -> _T:
-    """Return a dataclass field that, for given parameters, does not affect a model's outputs.
+    """Return a dataclass field that, for given parameters and inputs, affects rounding at most.
 
-    Examples are the initialisation, dropout and remat. Weight files that differ only in such fields
-    hold the same model.
+    Examples are the initialisation, dropout, remat and image size. Weight files that differ only in
+    such non-semantic fields hold the same model.
     """
     return dataclasses.field(default=default, metadata={_NON_SEMANTIC: True})
 
 
 def with_non_semantic_fields_of(other: Any, config: _T) -> _T:
-    """Return `config` with the non-semantic fields of `other`, also in parts that both have."""
+    """Return `config` with the non-semantic fields of `other`, also in parts of the same class."""
     if type(config) is not type(other) or not dataclasses.is_dataclass(config):
         return config
     changes = {
@@ -123,9 +123,9 @@ def with_non_semantic_fields_of(other: Any, config: _T) -> _T:
 
 
 def fingerprint_fields(config: Any) -> Any:
-    """Return the fields that the outputs depend on, as JSON values, without those at defaults.
+    """Return the fields that outputs depend on and that differ from their defaults, as JSON values.
 
-    A field that a later version adds therefore changes nothing while it is at its default.
+    A field that a later version adds therefore changes nothing while it has its default value.
     """
     if isinstance(config, tuple):
         return [fingerprint_fields(item) for item in config]

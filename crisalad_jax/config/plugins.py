@@ -19,7 +19,7 @@ from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import one_line
 
 ENTRY_POINTS = "crisalad_jax.plugins"
-"""Group of entry points under which an installed package names its modules of parts."""
+"""Group of entry points under which an installed package names its plug-in modules."""
 _PACKAGE = __name__.partition(".")[0]
 _FROM_FILE = "crisalad_plugin_"
 """Prefix of the names of modules that are loaded from plug-in files."""
@@ -39,7 +39,7 @@ def load_plugin(plugin: str) -> None:
         plugin: a file FILE.py, or the name of a module that can be imported.
 
     Raises:
-        InputError: there is no such file or module, or it raises.
+        InputError: there is no such file or module, or importing it raises an exception.
 
     Example:
         >>> lines = [
@@ -76,12 +76,12 @@ def load_plugin(plugin: str) -> None:
 
 
 def loaded_plugins() -> list[str]:
-    """Return what `load_plugins` takes to load the same plug-ins in another process."""
+    """Return the plug-ins loaded so far, for `load_plugins` in another process."""
     return list(_LOADED)
 
 
 def load_plugins(plugins: Iterable[str]) -> None:
-    """Load these plug-ins, and those of installed packages; raise what `load_plugin` raises."""
+    """Load the plug-ins of installed packages, then `plugins`, each as `load_plugin` does."""
     load_entry_points()
     for plugin in plugins:
         load_plugin(plugin)
@@ -121,10 +121,10 @@ def _import(spec: ModuleSpec) -> None:
 
 
 def plugin_failure(error: BaseException) -> str | None:
-    """Describe in one line an exception that plug-ins may have caused; None without plug-ins.
+    """Describe an exception that a plug-in may have caused, in one line; None without plug-ins.
 
-    If it came from a plug-in's code, the line says where. Otherwise a plug-in may have returned
-    something unusable, so the line names all plug-ins. `SystemExit` must come from a plug-in.
+    If a plug-in's code raised it, the line says where. Otherwise a plug-in may have returned
+    something unusable, so the line names all plug-ins; for a SystemExit the result is then None.
     """
     files = {str(sys.modules[name].__file__) for name in _LOADED.values()}
     places = [p for p in traceback.extract_tb(error.__traceback__) if p.filename in files]
@@ -139,8 +139,8 @@ def plugin_failure(error: BaseException) -> str | None:
 def home_of(module: str | None) -> str | None:
     """Return what `--plugin` takes to load a part's module: a file's name, or the module.
 
-    Files record it, without a folder, so that a copy on another machine is the same. None for
-    modules of this package, and if there is no file or no module, as in a notebook or in `exec`.
+    Weight files record it. It has no folder, so that it is the same on another machine. It is None
+    for modules of this package, and without a file or a module, as in a notebook or in `exec`.
     """
     if module is None or module.partition(".")[0] == _PACKAGE:
         return None
@@ -155,7 +155,7 @@ def load_entry_points() -> None:
     """Import the modules that installed packages name under `ENTRY_POINTS`, once.
 
     Raises:
-        InputError: what `load_plugin` raises.
+        InputError: a module is missing, or importing it raises an exception.
     """
     import importlib.metadata  # a fifth of the time of `crisalad --help`
 
@@ -164,9 +164,9 @@ def load_entry_points() -> None:
 
 
 def source_digest(part: type[Part]) -> str | None:
-    """Compute the digest of the file that defines a plug-in's part.
+    """Compute the SHA-256 of the file that defines a part of a plug-in.
 
-    None if there is no file, and for a part of this package, which the version identifies.
+    It is None without a file, and for parts of this package, which the version identifies.
     """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
     if part.__module__.partition(".")[0] == _PACKAGE or file is None:
@@ -175,7 +175,7 @@ def source_digest(part: type[Part]) -> str | None:
 
 
 def sources_of(config: Any) -> dict[str, tuple[str, str | None]]:
-    """Return the name and the source digest of every part in a configuration."""
+    """Return (name, `source_digest`) of every part in a configuration, by dotted field name."""
     return {
         field: (part.part_name, source_digest(type(part)))
         for field, part in parts_of(config).items()
@@ -183,7 +183,7 @@ def sources_of(config: Any) -> dict[str, tuple[str, str | None]]:
 
 
 def changed_sources(config: Any, recorded: Mapping[str, Any]) -> list[str]:
-    """Return the plug-ins' parts whose source differs from the recorded one, as "field name"."""
+    """List the parts, as "FIELD NAME", whose source has changed since `sources_of` recorded it."""
     changed = []
     for field, (name, digest) in sources_of(config).items():
         recorded_name, before = recorded.get(field, (None, None))

@@ -1,4 +1,4 @@
-"""How a photograph becomes a network's input: its size, filter and normalisation."""
+"""How a photograph becomes a network's input: size, resize filter and normalisation."""
 
 import dataclasses
 import math
@@ -12,11 +12,11 @@ from crisalad_jax.config.short_repr import short_repr
 Size = tuple[int, int]
 """Height and width in pixels."""
 BitDepth = Literal["high-byte", "contrast-stretch"]
-"""How colours of more than 8 bits become 8-bit ones."""
+"""Rule that reduces colours of more than 8 bits; see `PreprocessingConfig.bit_depth`."""
 LocalFeatures = Literal["sift", "orb"]
-"""Local features that can replace the pixels of photographs."""
+"""Kinds of hand-crafted local features that can replace the pixels as a model's input."""
 FEATURE_BYTES: Mapping[str, int] = {"sift": 129, "orb": 33}
-"""Bytes of a local feature: its descriptor's, and a last one that is 0 if there is no feature."""
+"""Bytes per local feature, by kind: its descriptor, then a byte of 1, or 0 for no feature."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
@@ -29,18 +29,17 @@ WORDS: Mapping[str, Mapping[str, Any]] = {
     "round": {"round_to_patch": True},
     **{name: {"bit_depth": name} for name in ("high-byte", "contrast-stretch")},
 }
-"""Values of the flag --resize, and the fields that they set."""
+"""Values of the flag `--resize`, and the fields of `PreprocessingConfig` that each sets."""
 
 
 @short_repr(switch=("normalisation", "local-contrast", "mean", "deviation"))
 @dataclasses.dataclass(frozen=True)
 class PreprocessingConfig:
-    """How a photograph becomes a network's input.
+    """How a photograph is resized and normalised for a network.
 
-    Published models differ in it, and another filter changes a descriptor by 1e-3 to 6e-2. The
-    defaults are torchvision's chain on Pillow images: `Resize`, `ToTensor`, `Normalize`.
-
-    Normalising before or after resizing is the same: the resize is linear; its weights sum to 1.
+    Published models differ in these settings, which change descriptors (docs/resizing.md). The
+    defaults are torchvision's `Resize`, `ToTensor` and `Normalize` on Pillow images. For "floats",
+    normalising before or after the resize is the same, because the filter's weights sum to 1.
 
     Example:
         >>> chain = PreprocessingConfig(filter="bicubic", pixels="floats")
@@ -54,30 +53,31 @@ class PreprocessingConfig:
     """Target size of an image. "fixed" is `ModelConfig.image_size`, whatever the aspect ratio. The
     others keep the aspect ratio: "shorter-side" resizes the shorter side to that of `image_size`,
     "longer-side" shrinks images until the longer side is at most that of `image_size` and never
-    enlarges, and "native" leaves images as they are. Their sides are then rounded to the nearest
-    multiples of the patch size, if the backbone takes no others."""
+    enlarges, and "native" leaves images as they are. Except under "fixed", sides are then rounded
+    to the nearest multiples of the patch size, if the backbone needs such sides."""
     filter: Literal["bilinear", "bicubic", "area"] = non_semantic_field("bilinear")
-    """Filter of the resize; "area" is OpenCV's INTER_AREA, which hloc uses."""
+    """Resize filter; "area" is OpenCV's INTER_AREA (if a side grows, INTER_LINEAR), as in hloc."""
     antialias: bool = non_semantic_field(True)
-    """Whether the filter widens when an image shrinks, as Pillow's always does."""
+    """Whether the filter widens when an image shrinks, as in Pillow; "area" ignores it."""
     pixels: Literal["bytes", "floats"] = non_semantic_field("bytes")
-    """What is resized: "bytes" are rounded after each pass, as Pillow does; "floats" are neither
-    rounded nor clamped, as torch does."""
+    """Type of the resized pixels: "bytes" are rounded to 8 bits, as in Pillow; "floats" are neither
+    rounded nor clamped, as in torch."""
     round_to_patch: bool = non_semantic_field(False)
-    """Whether images of a fixed size that is not a multiple of the patch size are resized again,
-    to the nearest one (halves to even), bilinear and antialiased. MegaLoc does so."""
+    """Whether, under "fixed", a second resize (bilinear, antialiased) rounds each side to the
+    nearest multiple of the patch size (halves to even), as MegaLoc does."""
     bit_depth: BitDepth = non_semantic_field("high-byte")
-    """How deeper colours become 8-bit, before the resize. "high-byte" drops the low byte of 16
-    bits. "contrast-stretch" spreads each image's own values, from the 1st to the 99th percentile,
-    over 0 to 255: for thermal images, whose values fill a small part of 16 bits, and for floats.
-    8-bit images do not change."""
+    """How colours of more than 8 bits are reduced to 8, before the resize. "high-byte" drops the
+    low byte of 16 bits. "contrast-stretch" maps the 1st to the 99th percentile of each image's
+    values to 0 to 255: for thermal images, whose values fill a small part of 16 bits, and for
+    floats. 8-bit images do not change."""
     normalisation: Literal["mean-deviation", "local-contrast"] = "mean-deviation"
-    """How pixels are normalised: by `mean` and `deviation`, or by those of each neighbourhood."""
+    """How pixels are normalised: by `mean` and `deviation`, or by those of the 21 x 21 pixels
+    around each pixel."""
     mean: tuple[float, float, float] = IMAGENET_MEAN
     """Mean of red, green and blue, for pixels from 0 to 1; by default ImageNet's."""
     deviation: tuple[float, float, float] = IMAGENET_DEVIATION
-    """Divisor of pixels from 0 to 1 minus the mean; by default ImageNet's. A network that takes
-    pixels from 0 to 255 minus a mean, such as hloc's NetVLAD, has a deviation of 1/255."""
+    """Standard deviation of red, green and blue: pixels minus the mean are divided by it. By
+    default ImageNet's; 1/255 if a network takes 0 to 255 minus a mean, as hloc's NetVLAD does."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -105,11 +105,11 @@ class PreprocessingConfig:
 
         Args:
             size: height and width of the image.
-            image_size: height and width of the model, `ModelConfig.image_size`.
+            image_size: height and width of the model's input, `ModelConfig.image_size`.
 
         Returns:
-            Height and width in pixels. "shorter-side" truncates the other side, as torchvision
-            does; "longer-side" rounds it, as hloc does.
+            Height and width in pixels. Fractions of a pixel are truncated for "shorter-side", as in
+            torchvision, and rounded for "longer-side", as in hloc.
 
         Example:
             >>> rule = PreprocessingConfig(size_rule="shorter-side")
@@ -131,14 +131,14 @@ class PreprocessingConfig:
         return height, width
 
     def rounded_size(self, size: Size, side_multiple: int) -> Size:
-        """Round sides to the nearest multiples, if sides are to be rounded.
+        """Return a size rounded to the nearest multiples of `side_multiple`, if `rounds` is True.
 
         Args:
-            size: height and width of `target_size`.
+            size: height and width in pixels, from `target_size`.
             side_multiple: number of pixels that sides have to be multiples of.
 
         Returns:
-            Height and width of the network's input.
+            Height and width of the network's input in pixels; `size` itself if `rounds` is False.
 
         Example:
             >>> PreprocessingConfig(size_rule="native").rounded_size((240, 320), 14)
@@ -150,17 +150,17 @@ class PreprocessingConfig:
         return height, width
 
     def for_training(self) -> "PreprocessingConfig":
-        """Return the chain for training: the same filter by Pillow's rules, at a fixed size.
+        """Return this configuration with a fixed size, 8-bit pixels and antialiasing, for training.
 
-        All published training loaders resize Pillow images: bytes, antialiased.
+        All published training loaders resize Pillow images, hence 8-bit pixels and antialiasing.
         """
         return dataclasses.replace(self, size_rule="fixed", pixels="bytes", antialias=True)
 
     def changed_by(self, words: Sequence[str]) -> "PreprocessingConfig":
-        """Return this chain with the fields set by values of --resize (see `WORDS`).
+        """Return this configuration changed by `words`: values of `--resize`, keys of `WORDS`.
 
         Raises:
-            InputError: an unknown value, two for one field, or one without effect.
+            InputError: an unknown value, two values for one field, or a value without effect.
 
         Example:
             >>> PreprocessingConfig().changed_by(["native", "bicubic"]).filter
@@ -184,7 +184,7 @@ class PreprocessingConfig:
         return changed
 
     def in_words(self, image_size: Size) -> str:
-        """Describe the resize of a model of this image size in a few words.
+        """Describe the resize to `image_size` (height, width) in a few words.
 
         Example:
             >>> PreprocessingConfig().in_words((224, 224))

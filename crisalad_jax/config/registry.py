@@ -1,4 +1,4 @@
-"""Registries of parts by name: built-in parts, and those of plug-ins."""
+"""Registries of parts (swappable classes, see `Part`) by name, built-in or of plug-ins."""
 
 import dataclasses
 import functools
@@ -16,11 +16,11 @@ from crisalad_jax.utils.errors import InputError, locate_errors
 
 _C = TypeVar("_C", bound=Callable[..., Any])
 REGISTRIES: dict[str, "Registry[Any]"] = {}
-"""All registries by kind."""
+"""All registries by kind of part, such as "aggregator"."""
 
 
 class Registry(Generic[P]):
-    """The parts of one kind by name."""
+    """The registered parts of one kind, such as aggregators or losses, by name."""
 
     def __init__(
         self,
@@ -31,16 +31,15 @@ class Registry(Generic[P]):
         find_other: Callable[[str], type[P] | None] = lambda name: None,
         others: str = "",
     ) -> None:
-        """Make the registry of a kind, and set `base.registry` to it.
+        """Create the registry of one kind of part, and set `base.registry` to it.
 
         Args:
             kind: what messages call a part of this kind, such as "aggregator".
             base: the class that all parts of this kind inherit from.
-            of_function: for kinds whose parts may be plain functions, returns the methods of the
-                part that wraps a function.
-            find_other: makes the class of a part that has a name but is not registered, or returns
-                None.
-            others: such names, for messages and help.
+            of_function: returns the methods, by name, of the part that wraps a plain function; None
+                if parts of this kind cannot be plain functions.
+            find_other: returns the class for a name that is not registered, or None.
+            others: what messages and help call the names that `find_other` accepts ("optax.NAME").
         """
         self.kind, self.base, self._of_function = kind, base, of_function
         self._find_other, self.others = find_other, others
@@ -52,15 +51,16 @@ class Registry(Generic[P]):
     def register(self, name: str, **presets: Mapping[str, Any]) -> Callable[[_C], _C]:
         """Return a decorator that registers a class, or a plain function, under `name`.
 
-        A class that is not a frozen dataclass yet becomes one.
+        A class that is not a dataclass yet becomes a frozen one.
 
         Args:
             name: name of the part in configurations, files and flags.
-            presets: for each model preset, by name, the fields that differ from the part's
-                defaults.
+            **presets: for each preset of model sizes, by name, the values of the fields that differ
+                from the part's defaults.
 
         Raises:
-            InputError: a name with ':' or ','; when decorating, a taken name or unfit part.
+            InputError: a name with ':' or ','; when decorating, a taken name or a part that does
+                not fit this kind.
         """
         where = f"register_{self.kind}"
         require(
@@ -127,7 +127,7 @@ class Registry(Generic[P]):
             raise
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of all parts, in order."""
+        """Iterate over the names of all registered parts, in alphabetical order."""
         return iter(sorted(self._parts))
 
     def __contains__(self, name: object) -> bool:
@@ -141,11 +141,11 @@ class Registry(Generic[P]):
 
         Args:
             name: the part's name.
-            plugin: the plug-in that registered it, if known.
-            where: what messages call the name; None is the kind.
+            plugin: the plug-in that registered the part, if known, for the message.
+            where: what the message calls the name; None calls it by this registry's kind.
 
         Raises:
-            InputError: there is none; the message lists all parts.
+            InputError: no part has this name; the message lists all parts.
         """
         if name not in self:
             load_entry_points()
@@ -162,20 +162,20 @@ class Registry(Generic[P]):
         return self._parts.get(name) or cast(type[P], self._find_other(name))
 
     def make(self, name: str, preset: str | None = None, **fields: Any) -> P:
-        """Make the part with this name, with its settings for a preset of model sizes.
+        """Make a part by name: its defaults, changed by a preset of model sizes, then by `fields`.
 
         Raises:
-            InputError: what `find` raises, or a field is out of range.
+            InputError: no part has this name, or a field is out of range.
         """
         part = self.find(name)
         return part(**{**self._presets.get(name, {}).get(preset or "", {}), **fields})
 
     def resolve(self, value: Any, where: str) -> P:
-        """Return a part as it is, or make the one with the given name.
+        """Return a part as it is or, given a name, make that part with its default settings.
 
         Args:
-            value: a part or its name.
-            where: what messages call the value.
+            value: a part of this kind, or its name.
+            where: what messages call the value, such as "ModelConfig.aggregator".
 
         Raises:
             InputError: a name that is not registered, or a value that is not a part of this kind.
@@ -199,7 +199,7 @@ def make_part(kind: str, name: str, **settings: Any) -> Any:
         **settings: fields of the part that differ from their defaults.
 
     Returns:
-        The part, for the configuration's field of that kind.
+        The part, to pass as the configuration's field for that kind.
 
     Raises:
         InputError: no such kind, part or setting, or a value that does not fit.
@@ -223,10 +223,10 @@ def make_part(kind: str, name: str, **settings: Any) -> Any:
 
 
 def add_named(kind: str, table: dict[str, Any], name: str, value: Any) -> None:
-    """Add a class or function to a plain table of names, for `register_{kind}`.
+    """Add `value`, a class or function, to a dictionary of names, for `register_{kind}`.
 
     Raises:
-        InputError: another module has taken the name.
+        InputError: the name is taken by a class or function of another module.
     """
     taken = table.get(name, value).__module__
     require(
@@ -241,17 +241,17 @@ def _home(part: type[Part]) -> str:
 
 
 def part_field(registry: Registry[P], default: str | type[P]) -> Any:
-    """Return a dataclass field for a part, by default the one with this name, or of this class."""
+    """Return a dataclass field for a part; `default` is the name or class of its default part."""
     make: Any = functools.partial(registry.make, default) if isinstance(default, str) else default
     return dataclasses.field(default_factory=make, metadata={REGISTRY: registry})
 
 
 def resolve_names(config: Any) -> None:
-    """Check a new configuration's types, and replace names with parts.
+    """Check the field types of a new configuration, and replace names of parts with the parts.
 
     Raises:
-        InputError: a name that is not registered, a value that is not a part of the kind, or what
-            `check_types` raises.
+        InputError: a name that is not registered, a value that is not a part of the field's kind,
+            or another value that is not of its field's type.
     """
     check_types(config)
     for field in dataclasses.fields(config):
@@ -263,7 +263,7 @@ def resolve_names(config: Any) -> None:
 
 
 def with_arguments(*offered: str) -> Callable[[Callable[..., Any]], Mapping[str, Any]]:
-    """Return a registry's `of_function` for parts whose method `apply` takes these arguments."""
+    """Return a `Registry`'s `of_function` for parts whose `apply` takes the `offered` arguments."""
 
     def methods(function: Callable[..., Any]) -> Mapping[str, Any]:
         count = count_arguments(function, *offered)
@@ -275,11 +275,11 @@ def with_arguments(*offered: str) -> Callable[[Callable[..., Any]], Mapping[str,
 def count_arguments(function: Callable[..., Any], *offered: str) -> int:
     """Return how many of the offered arguments, in their order, a plain function takes.
 
-    It takes those that it requires, and those whose names match the offered ones. A setting with a
-    default, such as `temperature=0.1`, keeps its default.
+    A function takes those that it requires, and those whose names match the offered ones. Any other
+    parameter, such as `temperature=0.1`, keeps its default.
 
     Raises:
-        InputError: it requires more arguments.
+        InputError: the function requires more arguments than are offered.
     """
     signature = inspect.signature(function)
     parameters = signature.parameters.values()

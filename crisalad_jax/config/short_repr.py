@@ -30,23 +30,23 @@ _STYLE = "__crisalad_style__"
 
 
 def short_repr(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]], type[_T]]:
-    """Return a decorator that gives a configuration the `repr` of `concise_repr`.
+    """Return a decorator that gives a configuration class the `repr` of `concise_repr`.
 
-    Its `help` shows the texts below its fields.
+    The `help` of the class then shows the docstrings below its fields, too.
 
     Args:
-        *always: fields that are printed even at their defaults.
-        switch: a field, the value at which other fields are unused, and their names; without names,
-            all others. They are left out, and not compared (`config.io.differences`).
+        *always: names of fields that are printed even at their defaults.
+        switch: a field, its value that makes other fields unused, and their names (without names,
+            all others). Unused fields are neither printed nor compared (`config.io.differences`).
     """
     return lambda cls: _print_in(_Style(always, switch), cls)
 
 
 def brief(cls: type[_T]) -> type[_T]:
-    """Give a result class a `repr` with one line for each field, whatever its size.
+    """Give a result class a `repr` that shortens the value of each field to at most one line.
 
-    Arrays print as type and shape, parameters as their count, collections as their first items.
-    `help` shows the texts below the fields.
+    Arrays print as type and shape, model parameters as their count, and collections of more than
+    four items as the first item. `help` shows the docstrings below the fields.
 
     Args:
         cls: a dataclass or NamedTuple.
@@ -75,12 +75,12 @@ def _style_of(value: Any) -> _Style:
 
 
 def concise_repr(value: Any) -> str:
-    """Write a value as the call that makes it, without fields that are unused or at defaults.
+    """Format a value as the call that makes it, without fields that are unused or at defaults.
 
-    A part at its defaults prints as its name. Long calls take a line for each field.
+    A field with a part at its defaults prints as the part's name. Long calls take a line per field.
 
     Args:
-        value: a dataclass, or a NamedTuple that is `brief`.
+        value: a dataclass, or a NamedTuple that `brief` decorates.
 
     Returns:
         For a configuration, valid Python once the classes that it names are imported.
@@ -94,7 +94,7 @@ def concise_repr(value: Any) -> str:
 
 
 def in_one_line(value: Any) -> str:
-    """Write any value for a message: a configuration in one line, others by their first line."""
+    """Format any value for a message: a configuration in one line, others by their first line."""
     first, *more = _write(value, math.inf).splitlines() or [""]
     return f"{first} ..." if more else first
 
@@ -171,14 +171,14 @@ def _shown(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
-    """Return the default of a field; `dataclasses.MISSING` without one."""
+    """Return the default of a field; `dataclasses.MISSING` if it has none."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return field.default
 
 
 def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
-    """List a configuration's fields, without those that its switch makes unused.
+    """List a configuration's fields, without those that its switch (`short_repr`) makes unused.
 
     Example:
         >>> from crisalad_jax import ProjectionConfig
@@ -193,7 +193,7 @@ def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
 
 
 def with_field_docs(cls: type[_T]) -> type[_T]:
-    """Let the `help` of a class end with the texts below its fields."""
+    """Append the docstrings below a class's fields to its `help`, and return the class."""
     doc = _Doc(cls.__doc__ or "")
     doc.kind = cls
     cls.__doc__ = doc
@@ -221,7 +221,7 @@ class _Doc(str):
 
 @functools.cache
 def field_docs(kind: type) -> Mapping[str, str]:
-    """Read the texts below the fields of a dataclass or NamedTuple and of its base classes."""
+    """Return the docstrings below a dataclass's or NamedTuple's fields, also inherited, by name."""
     docs: dict[str, str] = {}
     for each in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(each) and not hasattr(each, "_fields"):

@@ -1,1 +1,1 @@
-"""Images and data sets, using only numpy and OpenCV: this package does not import jax."""
+"""Images and data sets; this package does not import JAX."""

@@ -1,4 +1,4 @@
-"""Group the classes that train a descriptor by classification (CosPlace, EigenPlaces).
+"""Classes of images, in groups, to train a descriptor by classification (CosPlace, EigenPlaces).
 
 Two classes of one group are never neighbours, so images of one spot never belong to two classes of
 a group. Each group is a separate training set (`Places`) whose places are the classes.
@@ -26,7 +26,7 @@ _ONE_SPOT = 1e-3
 
 
 class Views(NamedTuple):
-    """City, heading and position of every image, the latter in metres in one UTM zone per city."""
+    """City index, position (metres in one UTM zone per city) and heading of every image."""
 
     city: Int32[np.ndarray, " images"]
     east: Float64[np.ndarray, " images"]
@@ -39,10 +39,10 @@ class Views(NamedTuple):
 
 
 def views_of(places: Places) -> Views:
-    """Project positions to UTM; a city's zone is that of its median longitude.
+    """Return the views of a set's images; a city's UTM zone is that of its median longitude.
 
     Raises:
-        InputError: a city is too wide for one plane.
+        InputError: a city spans more than 60 degrees of longitude, too wide for one plane.
     """
     count = len(places.files)
     latitude, longitude, heading = (
@@ -66,10 +66,10 @@ def views_of(places: Places) -> Views:
 
 
 def known_views(places: Places, what: str, *, headings: bool) -> Views:
-    """Return the views if all images have a position and, with `headings`, a heading too.
+    """Return `views_of` a set if all images have a position and, with `headings`, a heading.
 
     Raises:
-        InputError: some images lack one that `what` needs; or what `views_of` raises.
+        InputError: some have none (the message names `what`, which needs it); or too wide a city.
     """
     views = views_of(places)
     needed, column = ("headings, or no positions", ",heading") if headings else ("positions", "")
@@ -82,11 +82,11 @@ def known_views(places: Places, what: str, *, headings: bool) -> Views:
 
 
 class Class(NamedTuple):
-    """The images of one class; an image may belong to no class."""
+    """The indices of the images of one class; an image may belong to no class."""
 
     images: Int64[np.ndarray, " images"]
     group: int
-    """Classes of a group are not neighbours."""
+    """Number of its group; classes of one group are not neighbours."""
 
 
 def class_groups(
@@ -94,14 +94,14 @@ def class_groups(
 ) -> tuple[Places, ...]:
     """Make the groups that successive epochs train on, as sets whose places are classes.
 
-    At most `config.groups` groups are used: those with the most classes. Viewpoints make twice as
-    many: lateral and frontal groups alternate.
+    At most `config.groups` groups are used: those with the most classes. The kind "viewpoints"
+    gives up to twice as many: lateral and frontal groups alternate.
 
     Args:
-        places: all images, read with `min_images=1` for classes other than places.
+        places: the training set, read with `min_images=1` unless its places are the classes.
         config: how images are grouped into classes.
-        min_images: classes with fewer are left out.
-        places_per_batch: smallest number of classes in a group.
+        min_images: classes with fewer images are left out.
+        places_per_batch: smallest number of classes that a group may have.
 
     Raises:
         InputError: required positions are missing, no class has enough images, or a group has fewer
@@ -126,7 +126,7 @@ def class_groups(
 
 
 def find_classes(places: Places, config: ClassesConfig, min_images: int) -> list[list[Class]]:
-    """Make the sets of classes: a single one, or a lateral and a frontal one."""
+    """Make one set of classes or, for the kind "viewpoints", a lateral and a frontal one."""
     if config.kind == "places":
         return [_place_classes(places, views_of(places), config, min_images)]
     what = f"loss.kind.classes.kind {config.kind!r}{_ADVICE}"
@@ -137,7 +137,7 @@ def find_classes(places: Places, config: ClassesConfig, min_images: int) -> list
 
 
 def cell_classes(views: Views, config: ClassesConfig, min_images: int) -> list[Class]:
-    """Make CosPlace's classes: a square cell and a sector of headings (Berton et al. 2022, sec. 3).
+    """Make CosPlace's classes by square cell and sector of headings (Berton et al. 2022, sec. 3).
 
     Two classes of a group are at least `spacing - 1` cells, or `sector_spacing - 1` sectors, apart.
     """
@@ -151,10 +151,10 @@ def focal_classes(views: Views, config: ClassesConfig, min_images: int) -> list[
     """Make EigenPlaces' lateral and frontal classes of square cells (Berton et al. 2023, sec. 3).
 
     The first principal direction of a cell's positions is the direction of its street. A class
-    looks at one focal point, `focal_distance` from the cell's mean: across the street, or along it.
-    The paper crops images from panoramas. Here an image belongs to the class if its heading is
-    within `view_angle` of the direction from its position to the focal point. Of the two focal
-    points on each line, the one that more images look at is used.
+    looks at one focal point, `focal_distance` from the mean position: across the street (lateral)
+    or along it (frontal). The paper crops images from panoramas. Here an image belongs to the class
+    if its heading is within `view_angle` of the direction from its position to the focal point. Of
+    the two focal points on each line, the one that more images look at is used.
     """
     group, keys = _cells(views, config)
     sides: list[list[Class]] = [[], []]
@@ -176,7 +176,7 @@ def focal_classes(views: Views, config: ClassesConfig, min_images: int) -> list[
 def focal_points(
     positions: Float64[np.ndarray, "images 2"], distance: float
 ) -> Float64[np.ndarray, "side sign 2"] | None:
-    """Compute a cell's lateral and frontal focal points, two each; None if all positions agree."""
+    """Compute a cell's lateral and frontal focal points, two each; None if positions coincide."""
     mean = positions.mean(axis=0)
     _, spread, directions = np.linalg.svd(positions - mean, full_matrices=False)
     if spread[0] < _ONE_SPOT:

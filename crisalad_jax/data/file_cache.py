@@ -28,15 +28,15 @@ _DIGEST = 16
 class FileCache:
     """A cache of remote files; threads and processes may share its folder.
 
-    When a run first reads a file, it is compared with the remote one (by size and ETag, or what the
-    store offers); it is not checked again in that run.
+    The first time that a run reads a file, the cached copy is compared with the remote file (by
+    size and ETag, or what the store offers). The run does not check the file again.
     """
 
     def __init__(self, folder: pathlib.Path, limit: float) -> None:
-        """Set the folder, and the largest total size of its files in bytes.
+        """Create a cache in `folder`, whose files have at most `limit` bytes in total.
 
         Raises:
-            InputError: files cannot be created there.
+            InputError: files cannot be created in the folder.
         """
         check_folder(folder)
         self._folder, self._share, self._began = folder, limit / _FOLDERS, time.time()
@@ -45,7 +45,7 @@ class FileCache:
         """Read a remote file, from the cache if the copy there is current.
 
         Raises:
-            InputError: it is in neither place, or the address cannot be accessed.
+            InputError: there is no such remote file, or the address cannot be accessed.
         """
         name = _digest(address_of(path).encode()).hex()
         file = self._folder / str(int(name, 16) % _FOLDERS) / name

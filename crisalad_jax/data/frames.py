@@ -1,8 +1,8 @@
 """Names of frames of videos and robot logs, which include the time.
 
-A frame of a video is `walk.mp4#t=12.500`, with its time in seconds. A frame of a log (a ROS bag)
-is `walk.mcap#/camera/image_raw#t=1700000000.123456789`, with its topic and stamp. Such names are
-accepted wherever the path of an image is.
+A frame of a video is named `walk.mp4#t=12.500`, with its time in seconds. A frame of a log (a ROS
+bag) is named `walk.mcap#/camera/image_raw#t=1700000000.123456789`, with its topic and time stamp.
+Such names are accepted wherever the path of an image is.
 """
 
 import collections
@@ -19,7 +19,7 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 LOG_SUFFIXES = (".mcap", ".bag", ".db3")
 """Suffixes of robot logs, in lower case."""
 FASTEST = 1000.0
-"""Maximum frames per second: names of video frames have milliseconds."""
+"""Maximum frames per second, because names of video frames have times in milliseconds."""
 _TIME = re.compile(r"(.+)#t=(\d+)(?:\.(\d+))?", re.S)
 _TOPIC = re.compile(r"(.+)#([^#\s]+)", re.S)
 _OF_BAGS = b"rosbag2_bagfile_information"
@@ -32,7 +32,7 @@ _UNIX = 1_000_000_000
 
 
 class FrameName(NamedTuple):
-    """The parts of a frame's name."""
+    """The parts of a frame's name; the time is from a video's start, or a log's time stamp."""
 
     file: str
     """The video or log."""
@@ -42,7 +42,7 @@ class FrameName(NamedTuple):
 
     @property
     def milliseconds(self) -> int:
-        """The time in milliseconds, as in videos."""
+        """The time in milliseconds, rounded."""
         return round(self.nanoseconds / 1_000_000)
 
     def __str__(self) -> str:
@@ -73,7 +73,7 @@ def has_frames(path: str | os.PathLike[str]) -> bool:
 
 
 def parse_frame(path: str | os.PathLike[str]) -> FrameName | None:
-    """Parse the name of a frame, with any number of decimals; None for other names.
+    """Parse a frame's name, whatever the decimals of its time; return None for other names.
 
     Example:
         >>> parse_frame("walk.bag#/camera#t=1700000000.5")
@@ -137,7 +137,7 @@ def stored_bytes(path: str | os.PathLike[str]) -> int | None:
 
 
 def sequence_of(path: pathlib.PurePath) -> str:
-    """Return the sequence of an image: of a frame, its video, or log and topic; else its folder.
+    """Return the sequence that an image belongs to: its video, its log and topic, or its folder.
 
     Example:
         >>> sequence_of(pathlib.PurePosixPath("a/walk.bag#/camera#t=1700000000.5"))
@@ -148,7 +148,7 @@ def sequence_of(path: pathlib.PurePath) -> str:
 
 
 def by_sequence(paths: Sequence[pathlib.PurePath]) -> list[list[int]]:
-    """Return the indices of the images of each folder, video or topic, in order (`sequence_of`).
+    """Group the indices of images by their sequence (`sequence_of`), in order.
 
     Example:
         >>> by_sequence([pathlib.PurePosixPath(name) for name in ("a/1.jpg", "b/1.jpg", "a/2.jpg")])
@@ -161,7 +161,7 @@ def by_sequence(paths: Sequence[pathlib.PurePath]) -> list[list[int]]:
 
 
 def check_rate(fps: float) -> None:
-    """Raise InputError if a number of frames per second is out of range."""
+    """Raise InputError unless a number of frames per second is above 0 and at most `FASTEST`."""
     if not 0 < fps <= FASTEST:
         raise InputError(f"fps: found {fps:g}, expected more than 0, and at most {FASTEST:g}")
 
@@ -174,7 +174,7 @@ def sampled(milliseconds: Sequence[int], fps: float) -> list[int]:
         fps: frames per second (see `check_rate`); a rate above the video's chooses all.
 
     Returns:
-        Their indices.
+        The indices of these frames.
 
     Example:
         >>> sampled([0, 400, 800, 1200, 1600, 2000], 1)
@@ -193,7 +193,7 @@ class Moment(NamedTuple):
     """A time on some clock; times on different clocks cannot be compared."""
 
     clock: str
-    """The video, camera or simulation whose clock it is; "" is seconds since 1970."""
+    """Name of the video, camera or simulation whose clock it is; "" for seconds since 1970."""
     seconds: float
 
 

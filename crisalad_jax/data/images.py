@@ -28,9 +28,9 @@ from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.shapes import UInt8
 
 MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
-"""Environment variable for the largest image in pixels, which OpenCV reads when it is imported and
-checks before decoding. A small file can claim an image that fills the memory: if the variable is
-not set, this package sets 2**28, which takes 0.8 GB."""
+"""Environment variable with the maximum number of pixels of an image. OpenCV reads it when imported
+and checks it before decoding, because a small file can claim an image that fills the memory. If it
+is not set, this package sets it to 2**28, for which an image takes 0.8 GB."""
 OnBadImage = Literal["skip", "stop"]
 """What to do about an image that is missing or cannot be read: leave it out, or stop."""
 _OF_JPEG = (".jpg", ".jpeg", ".jpe", ".jfif")
@@ -124,9 +124,9 @@ def read_pixels(
     enough: tuple[int, int] | None = None,
     read_far: Callable[[str | os.PathLike[str]], bytes] = read_remote,
 ) -> np.ndarray:
-    """Read an image file as `read_image` does, at the file's bit depth; see `decode_image`.
+    """Read an image file as `read_image` does, but at the file's bit depth; see `decode_image`.
 
-    `read_far` reads the bytes of a remote file.
+    `read_far` is the function that reads the bytes of a remote file.
     """
     frame = parse_frame(path)
     if frame is None and is_remote(path):
@@ -151,11 +151,11 @@ def decode_image(
         enough: see `read_image`.
 
     Returns:
-        The image, upright: RGB, or grey (height, width). PNG, TIFF and PNM may
+        The image, upright: RGB (height, width, 3), or grey (height, width). PNG, TIFF and PNM may
         have more than 8 bits, which `prepare_image` reduces to 8 by the model's configuration.
 
     Raises:
-        InputError: what `read_image` raises.
+        InputError: `data` is empty, cut short, too large an image, or in another format.
     """
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
     # libjpeg write warnings to stderr that OpenCV's log level does not silence.
@@ -226,7 +226,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def jpeg_scans(data: bytes) -> int:
-    """Count the scans of a JPEG; other files have none."""
+    """Count the scans of a JPEG; return 0 for other files."""
     codes = (code for code, _ in _jpeg_segments(data)) if data.startswith(b"\xff\xd8") else ()
     return sum(code == 0xDA for code in itertools.takewhile(0xD9.__ne__, codes))
 
@@ -327,7 +327,7 @@ def images_below(
     Args:
         folder: the folder, local or remote.
         files: the files in it.
-        source: prefix of the message.
+        source: prefix of messages, such as the folder.
 
     Raises:
         InputError: none of them is an image.

@@ -38,11 +38,11 @@ class Frame(NamedTuple):
     """An image and its time."""
 
     name: str
-    """The file's path in its folder, or the camera's or video's name and the time."""
+    """Path of the file relative to the folder, or name of the camera or video and the time."""
     time: float
-    """Seconds into a video; else since 1970, of the file's last change or the camera's frame."""
+    """Seconds from a video's start; else since 1970: a file's last change, or the frame's stamp."""
     image: np.ndarray
-    """RGB or grey, upright, in the depth of the file; 8 bits from a camera."""
+    """RGB or grey, upright, at the file's bit depth; 8 bits from a camera."""
     taken: float
     """`time.perf_counter()` when the file was complete, or the camera's frame arrived."""
     dropped: int = 0
@@ -50,10 +50,10 @@ class Frame(NamedTuple):
 
 
 class FolderWatch:
-    """The images that appear in a folder and its subfolders, each once, when it is complete.
+    """A source of the images that appear in a folder and its subfolders, each once, when complete.
 
-    Existing images are left out. The folder is scanned 20 times a second, which works on any file
-    system. A JPEG or PNG is complete when it decodes; a file of another format when it has not
+    Existing images are left out. The folder is scanned up to 20 times a second, so any file system
+    will do. A JPEG or PNG is complete when it decodes; a file of another format when it has not
     changed for a second. A file that stays unreadable for five seconds is left out, with a warning.
 
     Example:
@@ -75,7 +75,7 @@ class FolderWatch:
         """List the existing images.
 
         Args:
-            folder: the folder.
+            folder: the folder to watch.
 
         Raises:
             InputError: there is no such folder.
@@ -84,7 +84,7 @@ class FolderWatch:
         check_folder(self._folder, "a folder to watch")
         self._done = set(self._scan())
         self.there = len(self._done)
-        """Number of images that existed before."""
+        """Number of images that existed when watching began."""
 
     def _scan(self) -> Iterator[pathlib.Path]:
         for parent, folders, files in os.walk(self._folder):
@@ -142,7 +142,7 @@ _Played = Generator[tuple[float, tuple[np.ndarray, float, str]]]
 
 
 class LatestFrame:
-    """A queue of one frame: a source that is filled from outside, for example by a ROS callback.
+    """A source with a queue of one frame, which other code fills, for example a ROS callback.
 
     A frame that is not taken before the next one arrives is dropped, and counted. Any thread may
     `put` frames while another one takes them.
@@ -168,7 +168,7 @@ class LatestFrame:
             fps: maximum frames per second that `frames` yields; None yields as many as requested.
 
         Raises:
-            InputError: the rate is out of range.
+            InputError: `fps` is not above 0, or is above 1000.
         """
         if fps is not None:
             check_rate(fps)
@@ -188,13 +188,13 @@ class LatestFrame:
         self.close()
 
     def put(self, image: np.ndarray, stamp: float, name: str | None = None) -> None:
-        """Add the newest frame, replacing one that waits.
+        """Add the newest frame, in place of one that has not been taken yet.
 
         Args:
             image: 8-bit RGB (height, width, 3), or anything else that `prepare_image` takes. It
                 must not change afterwards.
-            stamp: its time in seconds, for example since 1970.
-            name: its name in answers; None takes "camera" and the time.
+            stamp: time of the image in seconds, for example since 1970.
+            name: name of the image in answers; None makes one of "camera" and the time.
         """
         taken = time.perf_counter()
         name = frame_name("camera", round(1000 * stamp)) if name is None else name
@@ -205,7 +205,7 @@ class LatestFrame:
             self._changed.notify()
 
     def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
-        """Yield the newest frame, repeatedly, until the source is closed or ends.
+        """Yield the newest frame, repeatedly, until the source is closed.
 
         Args:
             check: called several times a second; it may raise to end the loop.
@@ -228,7 +228,7 @@ class LatestFrame:
                 return
 
     def close(self) -> None:
-        """End `frames` after the waiting frame."""
+        """End `frames` as soon as it has yielded the frame that waits, if any."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -264,14 +264,14 @@ class Camera(LatestFrame):
         """Open the camera.
 
         Args:
-            camera: its number from 0, a URL, a video file, or a robot log (a ROS bag).
+            camera: number of the camera from 0, a URL, a video file, or a robot log (a ROS bag).
             fps: maximum frames per second that `frames` yields; None yields as many as requested.
-            rate: speed at which a file plays, as a multiple of the recorded one.
+            rate: speed at which a file plays, as a multiple of the recorded speed.
             topic: topic of the images in a robot log; None takes the only one that has any.
 
         Raises:
-            InputError: it cannot be opened, or gives no frame; the rate is out of range; or the log
-                does not have the topic.
+            InputError: the camera cannot be opened, or gives no frame; `fps` or `rate` is out of
+                range; or the log does not have the topic.
         """
         super().__init__(fps=fps)
         require(0 < rate < math.inf, f"rate: found {rate:g}, expected more than 0")
@@ -284,7 +284,7 @@ class Camera(LatestFrame):
         self._is_file = from_log or pathlib.Path(given).is_file()
         self._rate = rate
         self.name = _name(given)
-        """Its name in messages, without a URL's user, password and query."""
+        """Name of the camera in messages, without the user, password and query of a URL."""
         self._begins = pathlib.Path(given).name if self._is_file else self.name
         self.size: Size | None
         """Height and width of the frames; None if the camera does not report it."""

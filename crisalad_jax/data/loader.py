@@ -48,11 +48,11 @@ class ImageBatch(NamedTuple):
     images: UInt8[np.ndarray, "batch h w 3"] | Float32[np.ndarray, "batch h w 3"]
     """8-bit pixels, or normalised floats; zeros where not valid."""
     labels: Int32[np.ndarray, " batch"]
-    """Place index, or tuple and role as one number (`losses.pairs.tuple_labels`); without groups,
-    position in the list of paths; -1 for padding."""
+    """Index of the image's place (or group); for mined tuples, tuple and role in one number
+    (`losses.pairs.tuple_labels`); otherwise, index in the list of paths. -1 for padding."""
     valid: Bool[np.ndarray, " batch"]
     indices: Int64[np.ndarray, " batch"]
-    """Image index, also for unreadable images; -1 for padding."""
+    """Index of the image in its set or list, also for unreadable images; -1 for padding."""
 
 
 class _OneThread:
@@ -92,7 +92,7 @@ class ImageCache:
         budget_bytes: int = 2**30,
         read_far: Callable[[str | os.PathLike[str]], bytes] = read_remote,
     ) -> None:
-        """Create an empty cache for `budget_bytes` of pixels; `read_far` reads remote files."""
+        """Create a cache for up to `budget_bytes` of pixels; `read_far` reads remote files."""
         self._room, self._read_far = budget_bytes, read_far
         self._images: dict[tuple[str, Preparation, bool], Pixels] = {}
         self._lock = threading.Lock()
@@ -102,7 +102,7 @@ class ImageCache:
     ) -> Pixels:
         """Read and prepare an image, from memory if it is cached; the array is read-only.
 
-        With `quickly` a JPEG may be decoded at a smaller size; see `read_image`.
+        With `quickly`, a large JPEG is decoded at a smaller size (`enough` of `read_image`).
 
         Raises:
             InputError: the image cannot be read.
@@ -145,7 +145,7 @@ class Reading:
     threads: NonNegativeInt = THREADS
     """Number of threads that decode ahead; 0 decodes in the caller's thread."""
     cache: ImageCache | None = None
-    """Cache of decoded images."""
+    """Cache of decoded images; None caches none."""
     quiet: bool = False
     """Whether to hide progress bars."""
 
@@ -155,7 +155,7 @@ class Reading:
         check_count("batch size", self.batch_size)
 
     def fitted(self, images: int) -> Self:
-        """Reduce the batch size if there are so few images that a batch would be mostly padding.
+        """Return these options with the batch size reduced to suit a small number of images.
 
         Example:
             >>> [Reading(batch_size=32).fitted(count).batch_size for count in (1, 3, 12, 20, 50)]
@@ -169,13 +169,13 @@ class Reading:
     ) -> Iterator[ImageBatch]:
         """Yield batches of image files, in order; the last one is padded.
 
-        If the size rule gives images different sizes, a batch holds consecutive images of one size,
-        and every change of size ends and pads a batch: then a `batch_size` of 1 saves work. Under
-        "skip" an unreadable image is not valid but keeps its index.
+        If prepared images differ in size, a batch holds consecutive images of one size, and every
+        change of size ends and pads a batch: if most sizes differ, a `batch_size` of 1 saves work.
+        Under "skip", an unreadable image is not valid but has its index.
 
         Args:
-            paths: the files.
-            preparation: how the model's images are prepared.
+            paths: the image files.
+            preparation: how the model's images are resized and normalised.
 
         Raises:
             InputError: while iterating, for an unreadable image under "stop".
@@ -200,11 +200,11 @@ class Reading:
         has_frames: bool,
         far: bool,
     ) -> Iterator[ImageBatch]:
-        """Yield batches of what `load` returns for each of `slots`, with its index and label.
+        """Yield batches of the images that `load` returns for `slots`, with indices and labels.
 
-        A batch holds the next `batch_size` images, or fewer where the size changes. At most one
-        thread reads video frames, because each thread would read the video from its beginning.
-        Remote images (`far`) get more threads, which mostly wait.
+        A batch holds the next `batch_size` images, or fewer if the size changes. With `has_frames`
+        at most one thread reads, because each would read the video from its beginning. Remote
+        images (`far`) get more threads, which mostly wait.
         """
         least = AT_ONCE if far and self.threads else 0
         threads = min(self.threads, 1) if has_frames else max(self.threads, least)
@@ -258,7 +258,7 @@ def training_batches(
     The same (seed, epoch, step) gives bit-identical batches for any `threads`, `start_step` and
     `part`. Images are resized to `image_size` (height, width), then augmented; large JPEGs are
     decoded at a smaller scale first (see `read_image`). An unreadable image stops the epoch or,
-    under "skip", leaves a slot that is not valid.
+    under "skip", is marked as not valid.
 
     Args:
         places: the places to draw from.
@@ -269,14 +269,14 @@ def training_batches(
         augmentation: changes each image; a registered augmentation, or its name.
         seed: seed of all random draws, together with the epoch and the step.
         epoch: index of the epoch, from 0.
-        preprocessing: how to resize, but always to `image_size`, antialiased, as bytes.
+        preprocessing: how to resize; always to `image_size`, antialiased, as bytes.
         steps: number of batches; None takes what the sampler draws: every place about once.
         start_step: the first batch to yield, to resume an interrupted epoch.
-        part: (i, n) yields the i-th of n equal parts of every batch, for the i-th of n processes.
+        part: (i, n) yields part i, from 0, of n equal parts of every batch, for one of n processes.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         threads: number of threads that decode ahead; 0 decodes in the caller's thread.
         cache: cache of decoded images between epochs.
-        describe: function from image files to descriptors, for samplers that use them.
+        describe: function from image files to descriptors, for samplers that need descriptors.
 
     Yields:
         The batches: pixels, labels, and which images are valid.
@@ -331,16 +331,16 @@ def batches_of_groups(
     """Yield batches of chosen images: groups of images of a place, or mined tuples.
 
     Args:
-        files: the images.
-        chosen: indices of the images of every batch.
-        labels: their labels.
-        image_size: see `training_batches`, also for the arguments below.
-        augmentation: changes each image; a group shares what is drawn for its place.
+        files: the set of the images.
+        chosen: indices in `files` of the images of every batch, in groups.
+        labels: labels of these images.
+        image_size: height and width in pixels that images are resized to.
+        augmentation: changes each image; the images of a group share what is drawn for their place.
         seed: numbers that seed the augmentation, together with the step.
-        preprocessing: see `training_batches`.
+        preprocessing: see `training_batches`, also for the arguments below.
         start_step: the first batch to yield.
-        part: (i, n) yields the i-th of n equal parts of every batch.
-        on_bad_image: "stop" or "skip".
+        part: (i, n) yields part i, from 0, of n equal parts of every batch.
+        on_bad_image: "stop" at an unreadable image, or "skip" it.
         threads: number of threads that decode ahead.
         cache: cache of decoded images.
 
@@ -348,7 +348,7 @@ def batches_of_groups(
         The batches.
 
     Raises:
-        InputError: what `training_batches` raises.
+        InputError: `start_step` or `part` is out of range; an image is unreadable, under "stop".
     """
     _, groups, images_per_group = chosen.shape
     batch_size = groups * images_per_group
@@ -399,8 +399,8 @@ def read_ahead(
     Closing the generator cancels work that has not started.
 
     Args:
-        work: the function.
-        items: its arguments.
+        work: the function to apply to each item.
+        items: the arguments of `work`.
         ahead: number of items to work on before they are requested.
         threads: number of threads; 0 works in the caller's thread.
     """
@@ -421,7 +421,7 @@ def read_ahead(
 
 
 def one_ahead(stream: Generator[_Item, None, None]) -> Generator[_Item, None, None]:
-    """Yield a stream's items, computing each in a thread while the previous one is in use.
+    """Yield a stream's items, computing each one in a thread while the previous one is in use.
 
     The first two are computed directly: for a single item, as in a search of a small map, starting
     a thread would take longer than the search.

@@ -1,4 +1,4 @@
-"""Hand-crafted local features of a photograph by OpenCV, as rows of bytes in an image's shape."""
+"""Hand-crafted local features of photographs by OpenCV, encoded as the bytes of an image."""
 
 import cv2
 import numpy as np
@@ -10,16 +10,16 @@ from crisalad_jax.utils.shapes import UInt8
 def encode_local_features(
     image: UInt8[np.ndarray, "h w 3"], kind: LocalFeatures, count: int
 ) -> UInt8[np.ndarray, "count third 3"]:
-    """Find the strongest local features of a photograph, with OpenCV's defaults.
+    """Return the strongest local features of a photograph, by OpenCV with its default settings.
 
     Args:
-        image: RGB.
+        image: 8-bit RGB.
         kind: "sift" (Lowe, IJCV 2004), of 128 values from 0 to 255; or "orb" (Rublee et al., ICCV
             2011), of 256 bits.
-        count: number of rows; those without a feature are 0.
+        count: number of rows; if fewer features are found, the remaining rows are 0.
 
     Returns:
-        A row of `FEATURE_BYTES` for each feature, strongest first, in the shape of an RGB image.
+        uint8 (count, `FEATURE_BYTES[kind]` / 3, 3): a row of bytes per feature, strongest first.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     detector = (cv2.SIFT if kind == "sift" else cv2.ORB).create(nfeatures=count)

@@ -65,7 +65,7 @@ class Topic(NamedTuple):
 
     name: str
     type: str
-    """As ROS 2 writes it, such as sensor_msgs/msg/Image."""
+    """Type of its messages as ROS 2 writes it, such as sensor_msgs/msg/Image."""
     count: int
     """Number of its messages."""
 
@@ -89,11 +89,11 @@ class Log:
     """A robot log: its topics, the images of one, and the positions of another.
 
     Stamps are nanoseconds since 1970: from the message's header or, if that has none, the time of
-    logging. Only headers stay in memory, and threads may share a log.
+    logging. Only stamps and positions stay in memory, and threads may share a log.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Open a log, as `open_log` does."""
+        """Open the log at `path`; unlike `open_log`, do not reuse an open one."""
         self.path = pathlib.Path(path)
         with _reader(self.path) as reader:
             found: dict[str, Topic] = {}
@@ -133,10 +133,10 @@ class Log:
 
         Args:
             name: the topic's name, or "none". None takes the only one of NavSatFix or, without any
-                of that type, the only one of odometry or poses; of several, a warning lists all.
+                of that type, of odometry or poses; if there are several, none, with a warning.
 
         Raises:
-            InputError: the log has no such topic, or it has no positions.
+            InputError: the log has no such topic, or the topic has no positions.
         """
         fixes, poses = self._topics(_FIXES), self._topics(_POSES)
         if name == "none":
@@ -173,7 +173,7 @@ class Log:
             topic: see `image_topic`.
 
         Raises:
-            InputError: what `image_topic` raises; or an image or the log cannot be read.
+            InputError: the topic is not one that `image_topic` accepts, or an image cannot be read.
         """
         name = self.image_topic(topic)
         for _, logged, message in self._messages([name]):
@@ -181,7 +181,7 @@ class Log:
             yield stamp, decode_message(message, str(FrameName(str(self.path), name, stamp)))
 
     def stamps(self, topic: str) -> Int64[np.ndarray, " n"]:
-        """Return the stamps of a topic's images, sorted, each once; warn if some were not.
+        """Return the stamps of a topic's images, sorted and unique; warn if they were not.
 
         Raises:
             InputError: the log cannot be read.
@@ -189,10 +189,10 @@ class Log:
         return self._frames(topic).stamps
 
     def read(self, topic: str, stamp: int, *, enough: tuple[int, int] | None = None) -> np.ndarray:
-        """Read the first image of a topic at or after a stamp, as `read_pixels` returns it.
+        """Read the first image of a topic at or after a stamp, as `read_pixels` reads a file.
 
         Raises:
-            InputError: there is none, or it cannot be decoded.
+            InputError: there is no such image, or it cannot be decoded.
         """
         name = str(FrameName(str(self.path), topic, stamp))
         self.image_topic(topic)
@@ -213,8 +213,8 @@ class Log:
             topic: see `position_topic`.
 
         Raises:
-            InputError: what `position_topic` raises, no position in the topic, or the log cannot be
-                read.
+            InputError: `position_topic` does not accept the topic, the topic has no position, or
+                the log cannot be read.
         """
         name = self.position_topic(topic)
         if name is None:
@@ -232,7 +232,7 @@ class Log:
         return Track(f"{self.path}#{name}", AXES[1 if is_fix else 2], times / 10**9, points)
 
     def scan(self, *topics: str) -> None:
-        """Read stamps and positions of topics in one pass; later calls reuse them.
+        """Read and store the stamps and positions of topics in one pass, for later calls.
 
         Raises:
             InputError: the log cannot be read.
@@ -302,7 +302,7 @@ class Log:
 
 
 def open_log(path: str | os.PathLike[str]) -> Log:
-    """Open a robot log; the last ones stay open.
+    """Open a robot log; the last two are cached until their files change.
 
     Args:
         path: a ROS 1 bag (.bag), or a ROS 2 bag: a file .mcap or .db3, or its folder.
@@ -426,7 +426,7 @@ def name_log_frame(frame: FrameName) -> pathlib.Path:
     """Name a log's frame by its actual stamp: the first at or after the frame's time.
 
     Returns:
-        The name. A time after the last frame is unchanged, for the reader to report.
+        The name. A time after the last frame is unchanged; reading that frame then fails.
 
     Raises:
         InputError: the log cannot be read, or has no such topic.
@@ -439,13 +439,13 @@ def name_log_frame(frame: FrameName) -> pathlib.Path:
 
 
 class ListedFrames(NamedTuple):
-    """Frames that were taken from a log."""
+    """The frames that `list_log_frames` takes from a log."""
 
     paths: list[pathlib.Path]
     there: int
-    """Number of all frames of the topic."""
+    """Number of all frames of the topic, also of those not taken."""
     positions: Positions | None
-    """Positions by path; None if there are none."""
+    """Positions of these frames by path; None if the log has none."""
 
 
 def list_log_frames(
@@ -459,12 +459,12 @@ def list_log_frames(
 
     Args:
         path: the log.
-        fps: see `list_frames`; counted from the first image.
+        fps: frames per second, counted from the first image; a rate above the log's lists all.
         topic: see `Log.image_topic`.
         position_topic: see `Log.position_topic`.
 
     Raises:
-        InputError: the log cannot be read; what `image_topic` and `position_topic` raise.
+        InputError: the log cannot be read, or does not have the topics.
     """
     log = open_log(path)
     name, place = log.image_topic(topic), log.position_topic(position_topic)

@@ -52,30 +52,30 @@ class Zone(NamedTuple):
         return 6.0 * self.number - 183
 
     def to_degrees(self, east: _Points, north: _Points) -> tuple[_Points, _Points]:
-        """Compute latitude and longitude, -180 to 180, of east and north in metres."""
+        """Convert east and north in metres to latitude and longitude (-180 to 180) in degrees."""
         latitude, turn = _inverse(east, north - _FALSE_NORTH * self.south)
         return latitude, (self.central + turn + 180) % 360 - 180
 
     def to_metres(self, latitude: _Points, longitude: _Points) -> tuple[_Points, _Points]:
-        """Compute east and north in metres in this plane, also for places outside the zone."""
+        """Convert degrees to east and north in metres of this zone, also for points outside it."""
         turn = (longitude - self.central + 180) % 360 - 180
         east, north = transverse_mercator(latitude, turn)
         return east, north + _FALSE_NORTH * self.south
 
 
 def continuous(longitude: _Points) -> _Points:
-    """Make longitudes continuous where they lie on both sides of 180 degrees."""
+    """Shift longitudes in degrees by multiples of 360 to within 180 of the first one."""
     return longitude[0] + (longitude - longitude[0] + 180) % 360 - 180
 
 
 def to_metres(latitude: _Points, longitude: _Points) -> tuple[_Points, _Points]:
-    """Compute east and north in the zone of the median longitude; longitudes are `continuous`."""
+    """Convert degrees (longitudes `continuous`) to metres in the median longitude's UTM zone."""
     central = 6 * np.floor(np.median(longitude) / 6) + 3
     return transverse_mercator(latitude, longitude - central)
 
 
 def transverse_mercator(latitude: _Points, longitude: _Points) -> tuple[_Points, _Points]:
-    """Compute UTM's east and north in metres; north is negative in the south.
+    """Compute UTM's east and north in metres; north is negative south of the equator.
 
     Args:
         latitude: degrees on WGS84.
@@ -111,9 +111,9 @@ def _inverse(east: _Points, north: _Points) -> tuple[_Points, _Points]:
 
 
 def comparable(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "point axis"]:
-    """Compute points in metres whose straight-line distances are those on the ground.
+    """Convert degrees to points in metres whose distances approximate those on the ground.
 
-    They are east and north if all are in one UTM zone, else `on_ellipsoid`.
+    The points are UTM east and north if all are in one zone, else three coordinates `on_ellipsoid`.
     """
     longitude = continuous(longitude)
     if len(np.unique(np.floor(longitude / 6))) == 1:
@@ -122,9 +122,9 @@ def comparable(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "po
 
 
 def on_ellipsoid(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "point 3"]:
-    """Compute points in metres from the Earth's centre, whose distances are chords.
+    """Convert degrees to Cartesian coordinates in metres from the Earth's centre.
 
-    Chords are shorter than distances on the ground: by 1 micrometre at 1 km, by 1 km at 1000 km.
+    Distances between points are chords: too short by 1 micrometre at 1 km, by 1 km at 1000 km.
     """
     phi, turn = np.deg2rad(latitude), np.deg2rad(longitude)
     radius = _EQUATOR / np.sqrt(1 - _SQUARE * np.sin(phi) ** 2)
@@ -135,7 +135,7 @@ def on_ellipsoid(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "
 
 
 def flattened(points: Float64[np.ndarray, "point axis"]) -> Float64[np.ndarray, "point 2"]:
-    """Return points as a map draws them: east and north unchanged, others equirectangular."""
+    """Return points for a drawn map: east and north unchanged, ellipsoid points equirectangular."""
     if points.shape[1] == 2:
         return points
     x, y, z = points.T

@@ -3,8 +3,8 @@
 GSV-Cities (Ali-bey et al. 2022) has `Dataframes/{city}.csv` with one row per image, which is
 `Images/{city_id}/{city_id}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}.jpg`.
 
-Images as close as two images of one place may be must not be negatives: places this close are
-listed as `near` each other, and never share a batch.
+Two places can be so close that their images are no farther apart than images of one place. Such
+places are listed as `near` each other and never share a batch, so they are never negatives.
 """
 
 import collections
@@ -48,15 +48,15 @@ _APART = 4
 at most two radii apart, and those of two places at least two."""
 
 View = Sequence[float]
-"""Latitude, longitude and heading of an image, NaN where it has no heading."""
+"""Latitude, longitude and heading of an image in degrees; NaN for an unknown heading."""
 
 
 class FoundPlace(NamedTuple):
-    """A place as its reader finds it."""
+    """A training place as found by a reader; `city` is an index in the reader's list of cities."""
 
     name: str
     images: Mapping[str, View | None]
-    """Views by path relative to the root; None if positions are unknown."""
+    """View of each image by its path relative to the root; None if its position is unknown."""
     near: Sequence[int] = ()
     """Indices of places that are too close to share a batch with it."""
     city: int = 0
@@ -65,7 +65,7 @@ class FoundPlace(NamedTuple):
 def read_gsv_cities(
     root: pathlib.Path, cities: Sequence[str] | None, on_bad_image: OnBadImage
 ) -> tuple[tuple[str, ...], list[FoundPlace]]:
-    """Return the cities, and their places sorted by id.
+    """Return the names of the cities of GSV-Cities, and their places sorted by id.
 
     Images may end in .jpg or .JPG, and may be in a folder named after the city id or the CSV file.
 
@@ -146,13 +146,13 @@ def _read_city(
 def read_msls_places(
     root: pathlib.Path, cities: Sequence[str] | None, on_bad_image: OnBadImage
 ) -> tuple[tuple[str, ...], list[FoundPlace]]:
-    """Return the cities of raw MSLS, and their places: the clusters of its tables.
+    """Return the cities of MSLS as published, and their places: the clusters of its tables.
 
-    By default the cities are those of its training set. A place has images of both the database and
-    the queries; panoramas are left out.
+    If `cities` is None, they are those of the training set. A place has images of the database and
+    of the queries; panoramas are left out.
 
     Raises:
-        InputError: there are no such cities, or what `read_msls` raises.
+        InputError: there are no such cities; a table is not valid; or an image is missing.
     """
     folders = city_folders(root, MSLS_CITIES["train"] if cities is None else cities)
     found: list[FoundPlace] = []
@@ -245,19 +245,19 @@ def _read_table(
 def places_by_position(
     source: ImageSource, radius: float, positions: str | os.PathLike[str] | None
 ) -> list[FoundPlace]:
-    """Group images into places of a radius, each named after the image at its centre.
+    """Group images into places of a given radius, each named after the image at its centre.
 
-    In the order of the images, one that is farther than the radius from all centres becomes a
-    centre. Then every image joins the place with the nearest centre.
+    In order, each image that is farther than the radius from all previous centres becomes a centre.
+    Then every image joins the place with the nearest centre.
 
     Args:
         source: the images.
         radius: radius of a place in metres.
-        positions: a table (`read_image_table`) or track (`read_track`); None takes those of the
-            source if it is a table, else those in @UTM names, else the EXIF data of JPEGs.
+        positions: a table (`read_image_table`) or track (`read_track`); None takes the positions of
+            the source, else those in @UTM names, else those in the EXIF data of JPEGs.
 
     Raises:
-        InputError: no image has a position, or what `positions_of` raises.
+        InputError: no image has a position, or the table or track is not valid.
     """
     found = source.located(positions)
     names = [name for name in source.names if name in found.of]
@@ -286,7 +286,7 @@ def places_by_position(
 
 
 def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
-    """Make each `frames` consecutive images of a folder or video a place, named after the first.
+    """Make places of `frames` consecutive images of a folder or video, named after the first.
 
     Consecutive places of one folder or video are too close to share a batch.
     """

@@ -1,4 +1,4 @@
-"""Training places from a layout such as GSV-Cities', or made by position or order."""
+"""Training places: read from a layout such as GSV-Cities', or grouped by position or order."""
 
 import dataclasses
 import functools
@@ -35,7 +35,7 @@ from crisalad_jax.utils.shapes import Float64, Int32, Int64
 @brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class Places:
-    """Images grouped by place: place p owns images `place_start[p]` to `place_start[p + 1]`.
+    """Images grouped by place: place p has the images `place_start[p]:place_start[p + 1]`.
 
     Example:
         >>> found = read_places(places, min_images=2)
@@ -53,9 +53,9 @@ class Places:
     names: tuple[str, ...]
     """Name of each place."""
     views: Float64[np.ndarray, "images 3"] | None = None
-    """Latitude, longitude and heading of each image; NaN for an unknown heading."""
+    """Latitude, longitude and heading of each image in degrees; NaN for an unknown heading."""
     near: tuple[Int64[np.ndarray, " _"], ...] | None = None
-    """For each place, those too close to share a batch with it; None if any two may."""
+    """For each place, the places too close to share a batch with it; None if any two may."""
 
     @property
     def image_counts(self) -> Int64[np.ndarray, " places"]:
@@ -64,7 +64,7 @@ class Places:
 
     @functools.cached_property
     def image_place(self) -> Int32[np.ndarray, " images"]:
-        """Place of each image, ascending."""
+        """Index of each image's place, ascending."""
         return np.repeat(np.arange(len(self.names), dtype=np.int32), self.image_counts)
 
     def path(self, image: int | np.integer) -> pathlib.Path:
@@ -107,10 +107,10 @@ def read_places(
     topic: str | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> Places:
-    """Read training places from a folder in the layout of GSV-Cities or MSLS, or in a custom one.
+    """Read training places in the layout of GSV-Cities, of MSLS or a custom one, or group images.
 
-    Or group the images of any source into places, by position or order. Places that are too close
-    to tell apart (`Places.near`) then never share a batch.
+    `place_radius` or `place_frames` groups the images of any source into places, by position or
+    order. Such places that are too close to tell apart (`Places.near`) never share a batch.
 
     A custom layout is a folder in which each folder with images is a place; or a table with the
     columns `name,place` and, if known, `lat,lon`, `heading` (all in degrees) and `city`: a file, or
@@ -130,8 +130,8 @@ def read_places(
         cities: names of CSV files without the suffix, or of MSLS's folders; None reads all, or for
             MSLS those of its training set.
         min_images: minimum images per place; a warning counts places left out.
-        place_radius: radius of a place in metres. In the order of the images, one that is farther
-            than this from all centres becomes a centre; then each image joins the place with the
+        place_radius: radius of a place in metres. In order, each image that is farther than this
+            from all previous centres becomes a centre; then each image joins the place with the
             nearest centre. Centres in a batch are more than four radii apart.
         place_frames: number of consecutive images of a folder, or frames of a video, that make a
             place. Consecutive places never share a batch.
@@ -189,7 +189,7 @@ def check_grouping(place_radius: float | None, place_frames: int | None) -> None
     """Check the arguments that group images into places; see `read_places`.
 
     Raises:
-        InputError: the radius is not a distance, or fewer than two frames.
+        InputError: the radius is not a distance above 0, or `place_frames` is below 2.
     """
     if place_radius is not None and not 0 < place_radius < math.inf:
         raise InputError(f"--place-radius: found {place_radius:g}, expected metres above 0")
@@ -211,11 +211,11 @@ def group_images(
         source: the images.
         place_radius: see `read_places`, also for the arguments below.
         place_frames: number of consecutive images.
-        positions: table or track; None takes those of the source.
+        positions: table or track; None takes the positions of the source.
         min_images: places with fewer images are left out.
 
     Raises:
-        InputError: no position, or no place large enough.
+        InputError: no image has a position, or no place is large enough.
     """
     if place_radius is not None:
         found = places_by_position(source, place_radius, positions)

@@ -32,15 +32,15 @@ its plane are correct to about one percent."""
 
 @brief
 class Positions(NamedTuple):
-    """Positions by image name; images without a position are absent."""
+    """Positions by image name, in `axes` (one of `AXES`); images without a position are absent."""
 
     axes: tuple[str, str]
     of: dict[str, tuple[float, float]]
     zone: Zone | None = None
-    """The zone of east and north; None if it is unknown, and for other axes."""
+    """UTM zone of east and north; None if unknown, and for other axes."""
 
     def check(self) -> None:
-        """Raise InputError for unknown axes, or if a position is not two numbers in range."""
+        """Raise InputError if the axes are unknown, or a position is not two numbers in range."""
         if self.axes not in AXES:
             raise InputError(f"positions: found axes {self.axes}, expected one of {AXES}")
         for name, at in self.of.items():
@@ -66,8 +66,8 @@ class Positions(NamedTuple):
             zone: the map's zone; None if unknown.
 
         Raises:
-            InputError: what `check` raises; other axes without a known zone, or a place far from
-                the map's zone.
+            InputError: the positions do not pass `check`; the axes differ and the zone is unknown;
+                or a position is far from the map's zone.
         """
         self.check()
         metres, degrees, _ = AXES
@@ -109,14 +109,14 @@ def utm_position(name: str) -> tuple[float, float] | None:
 def utm_zones(names: Sequence[str]) -> list[Zone | None]:
     """Read the zone of each `@UTM_east@UTM_north@zone@letter@...` name.
 
-    The letter is that of the band of latitude, or else N or S for the hemisphere. If no two names
-    contradict each other, all get the same zone; None if it is unknown.
+    The letter is that of the band of latitude, or else N or S for the hemisphere. If all names with
+    a zone agree, all images get that zone; None if no name has one.
 
     Args:
         names: names or paths of images with a `utm_position`.
 
     Raises:
-        InputError: several zones or hemispheres, and a name without one.
+        InputError: the names have several zones or hemispheres, and one name has none.
     """
     zones = [_zone_of(name.rpartition("/")[2]) for name in names]
     known = set(zones) - {None}
@@ -146,7 +146,7 @@ def _zone_of(name: str) -> Zone | None:
 def utm_degrees(
     names: Sequence[str], zones: Sequence[Zone | None], metres: Float64[np.ndarray, "image 2"]
 ) -> Float64[np.ndarray, "image 2"]:
-    """Compute latitude and longitude of images whose zones are all known.
+    """Convert east and north in metres to latitude and longitude, each image in its `zones`.
 
     Raises:
         InputError: metres out of range.
@@ -166,10 +166,10 @@ def utm_degrees(
 def utm_positions(names: Sequence[str]) -> Positions:
     """Read the positions of the images with names `@UTM_east@UTM_north@zone@letter@...`.
 
-    They are east and north in metres or, if the images are of several zones, degrees.
+    Positions are east and north in metres or, if there are several zones, degrees.
 
     Raises:
-        InputError: several zones, and a name without its zone or with metres out of range.
+        InputError: there are several zones, and a name has no zone or has metres out of range.
     """
     found = ((name, utm_position(name.rpartition("/")[2])) for name in names)
     of = {name: position for name, position in found if position is not None}
@@ -190,15 +190,15 @@ def positions_of(
     """Return given positions, or those of a file, under the names that images have on disk.
 
     Args:
-        given: positions by name, or the file of a table with a position in every row; names of
+        given: positions by name, or the file of a table with a position in every row; positions of
             other images stay. Or positions by time: a track or its file (`read_track`).
         names: names of the images.
-        paths: their files.
-        images: where these are, for messages.
+        paths: the files of the images, in the order of `names`.
+        images: folder of the images, for messages.
 
     Raises:
-        InputError: none of the images is named, or was taken along the track; or what
-            `read_image_table` and `read_track` raise.
+        InputError: none of the images is in the table, or was taken along the track; or the table
+            or track is not valid.
     """
     if not isinstance(given, Positions | Track) and is_track(given):
         given = read_track(given)
@@ -310,8 +310,8 @@ def read_image_table(
         The images' names in the table's order, and their positions; None without such columns.
 
     Raises:
-        InputError: what `read_table`, `Table.axes` and `Table.named_rows` raise; or a value that is
-            not a finite number, latitude or longitude.
+        InputError: the file cannot be read; a column is missing or ambiguous; a name is missing or
+            repeated; or a value is not a finite number, latitude or longitude.
     """
     table = read_table(pathlib.Path(path), "name", any_spelling=True)
     axes = table.axes("name", must=all_positions)
@@ -348,7 +348,7 @@ def _exif(path: str | os.PathLike[str] | BinaryIO, group: int) -> dict[int, Any]
 
 
 def exif_position(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, float] | None:
-    """Read latitude and longitude in degrees; None if a file has none that are valid."""
+    """Read a JPEG's latitude and longitude in degrees; None if it has none that are valid."""
     # EXIF data of any maker may be wrong in any way, and is then ignored.
     with contextlib.suppress(Exception):
         fields = _exif(path, _GPS)
@@ -365,8 +365,8 @@ def exif_time(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, bool] | N
     """Read when a JPEG was taken.
 
     Returns:
-        Seconds since 1970, and whether their zone is known; without one they are taken as UTC.
-        None if a file has no valid time.
+        Seconds since 1970, and whether the time zone is known; if not, the time is taken as UTC.
+        None if the file has no valid time.
     """
     with contextlib.suppress(Exception):
         fields = _exif(path, _EXIF)
@@ -385,10 +385,10 @@ def _degrees(fields: dict[int, Any], reference: int, value: int, signs: bytes) -
 
 
 def exif_positions(images: Iterable[tuple[str, pathlib.Path]]) -> Positions:
-    """Read the EXIF positions of images, for those that have one.
+    """Read the positions in the EXIF data of images; images without one are absent.
 
     Args:
-        images: the name and file of each.
+        images: name and file of each image.
     """
     each = list(images)
     found = for_each(exif_position, [path for _, path in each])

@@ -31,7 +31,7 @@ _noted = threading.Lock()
 def as_rgb(
     image: Any, bit_depth: BitDepth = "high-byte", name: str = "image"
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return pixels as 8-bit RGB.
+    """Convert an image to 8-bit RGB.
 
     Args:
         image: RGB (height, width, 3), or grey (height, width) or (height, width, 1). uint8 or
@@ -40,7 +40,7 @@ def as_rgb(
         name: prefix of messages, such as the file.
 
     Raises:
-        InputError: it is not such an array, or none of its values is finite.
+        InputError: `image` is not such an array, or none of its values is finite.
 
     Example:
         >>> import numpy as np
@@ -110,9 +110,9 @@ class Preparation:
     )
     """Function that raises InputError for a height and width that the model cannot describe."""
     local_features: LocalFeatures | None = None
-    """Local features that replace the pixels, if any."""
+    """Kind of local features that replace the pixels; None for pixels."""
     encoded_size: Size | None = None
-    """Height and width of the encoded local features."""
+    """Height and width of the array that encodes the local features; None for pixels."""
 
     def __post_init__(self) -> None:
         """Check the size."""
@@ -135,28 +135,28 @@ class Preparation:
 
     @property
     def dtype(self) -> type[np.generic]:
-        """Type of prepared images: uint8 pixels, or normalised float32."""
+        """Type of prepared images: uint8 for pixels as bytes, float32 for normalised floats."""
         return np.uint8 if self.preprocessing.pixels == "bytes" else np.float32
 
     def size_of(self, size: Size) -> Size:
-        """Return the height and width of an image of `size` after preparation."""
+        """Return the height and width that an image of `size` (height, width) has when prepared."""
         if self.encoded_size is not None:
             return self.encoded_size
         first = self.preprocessing.target_size(size, self.image_size)
         return self.preprocessing.rounded_size(first, self.side_multiple)
 
     def prepare(self, image: np.ndarray, name: str = "image") -> Pixels:
-        """Resize an image, and normalise it if it is float.
+        """Resize an image and, if the model takes "floats", normalise it.
 
         Args:
             image: RGB or grey, as `as_rgb` takes it.
             name: the image's name, for messages.
 
         Returns:
-            8-bit pixels, or normalised float32; or the bytes of local features.
+            RGB (height, width, 3): 8-bit, or normalised float32; or bytes of local features.
 
         Raises:
-            InputError: the image is not an array of pixels, or what `check_size` raises.
+            InputError: `as_rgb` refuses the image, or `check_size` refuses its size.
         """
         how = self.preprocessing
         image = as_rgb(image, how.bit_depth, name)
@@ -184,7 +184,7 @@ def normalised(pixels: Pixels, how: PreprocessingConfig) -> Float32[np.ndarray, 
 
     Args:
         pixels: RGB (..., 3), 8-bit or floats.
-        how: its mean and deviation are for pixels from 0 to 1.
+        how: configuration with the mean and deviation, which are for pixels from 0 to 1.
     """
     mean, deviation = (np.array(each, np.float32) for each in (how.mean, how.deviation))
     return (pixels / np.float32(255) - mean) / deviation

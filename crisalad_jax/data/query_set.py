@@ -21,19 +21,19 @@ from crisalad_jax.utils.shapes import Int64
 @brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class QuerySet:
-    """Queries that have positives in a database, and these positives."""
+    """Queries that have positives in a database, with their positives."""
 
     root: pathlib.Path
     files: tuple[str, ...]
     """Paths of the images, as text: the database, then all queries."""
     database: int
-    """Number of database images, the first of `files`."""
+    """Number of database images, which come first in `files`."""
     queries: Int64[np.ndarray, " query"]
     """Index in `files` of each query that has positives."""
     positives: tuple[Int64[np.ndarray, " _"], ...]
-    """For each query, the database images of its place, at least one, ascending."""
+    """For each query, the indices of its positives, at least one, ascending."""
     near: tuple[Int64[np.ndarray, " _"], ...]
-    """For each query, the images that are not negatives, ascending, positives included."""
+    """For each query, the database images that are not negatives, positives included, ascending."""
 
     def path(self, image: int | np.integer) -> pathlib.Path:
         """Return the path of one image."""
@@ -54,16 +54,16 @@ def read_query_set(
     Args:
         root: a folder or file; from a folder with several splits, `train` is read.
         positive_radius: radius of positives in metres, inclusive.
-        negative_radius: metres within which database images are not negatives.
+        negative_radius: metres from a query within which database images are not negatives.
         images: the folder of the images that a file names.
-        on_bad_image: see `open_benchmark`.
+        on_bad_image: "stop" refuses missing images; under "skip" training leaves them out.
 
     Returns:
-        The set, without queries lacking positives.
+        The set, without the queries that have no positive.
 
     Raises:
-        InputError: what `open_benchmark` raises; the set has neither positions nor ground truth, or
-            no query has positives and negatives.
+        InputError: `open_benchmark` cannot read the set; it has neither positions nor ground truth,
+            or no query has positives and negatives.
 
     Example:
         >>> import shutil

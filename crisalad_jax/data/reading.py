@@ -1,4 +1,4 @@
-"""Read the images of a list of files in batches."""
+"""Read a list of image files in batches."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +24,7 @@ def image_batches(
 ) -> Iterator[ImageBatch]:
     """Yield batches of the images in `paths`, in order; the last one is padded to `batch_size`.
 
-    See `Reading.batches`.
+    If images differ in size, a batch holds consecutive images of one size (`Reading.batches`).
 
     Args:
         paths: image files.

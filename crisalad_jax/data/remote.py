@@ -1,7 +1,7 @@
 """Read remote images, at addresses such as s3://bucket/frames, with fsspec.
 
-A path holds an address as `pathlib` writes it, with one slash: `s3:/bucket/frames`. So names,
-patterns and folders are paths everywhere, and only code that accesses files uses this module.
+A path holds an address as `pathlib` writes it, with one slash: `s3:/bucket/frames`. Names, patterns
+and folders are therefore paths everywhere, and only code that accesses files uses this module.
 """
 
 import contextlib
@@ -49,7 +49,7 @@ def address_of(path: str | os.PathLike[str]) -> str:
 
 
 def whole_name(folder: pathlib.Path) -> str:
-    """Return the address of a folder, or its absolute path without links."""
+    """Return the address of a remote folder, or a local one's absolute path with links resolved."""
     return address_of(folder) if is_remote(folder) else real_path(folder).as_posix()
 
 
@@ -57,7 +57,7 @@ def check_address(path: str | os.PathLike[str]) -> None:
     """Check that an address contains no secrets, because names and messages repeat it.
 
     Raises:
-        InputError: it has a user, or a query, which may be a signature.
+        InputError: the address has a user, or a query string, which may be a signature.
     """
     found = _SECRET.match(address_of(path))
     if found is not None:
@@ -100,10 +100,10 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[Any, str]]:
 
 
 def read_remote(path: str | os.PathLike[str]) -> bytes:
-    """Read the file at an address.
+    """Return the bytes of the file at an address.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: the file cannot be read.
     """
     with _opened(path) as (files, there):
         return files.cat_file(there)
@@ -111,10 +111,10 @@ def read_remote(path: str | os.PathLike[str]) -> bytes:
 
 @contextlib.contextmanager
 def open_beginning(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Open the file at an address to read only its beginning.
+    """Open the file at an address for reading its beginning, such as EXIF data.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: the file cannot be read.
     """
     with _opened(path) as (files, there), files.open(there, block_size=_HEADER) as file:
         yield file
@@ -164,7 +164,7 @@ def list_names(folder: pathlib.Path) -> list[str]:
 
 
 def state_of(path: pathlib.Path) -> str | None:
-    """Return a text that changes when the file does; None if there is no file.
+    """Return a text that changes when a local or remote file does; None if there is no file.
 
     Raises:
         InputError: an address cannot be accessed.
@@ -186,7 +186,7 @@ def _if_there(path: pathlib.Path, ask: Callable[[Any, str], _T]) -> _T | None:
 
 
 def for_each(work: Callable[[pathlib.Path], _T], paths: Sequence[pathlib.Path]) -> Iterable[_T]:
-    """Apply a function to files and return its results, several at a time if remote."""
+    """Return a function's results for paths, in order; several are processed at once if remote."""
     if not any(map(is_remote, paths)):
         return map(work, paths)
     with ThreadPoolExecutor(AT_ONCE) as threads:
@@ -194,10 +194,10 @@ def for_each(work: Callable[[pathlib.Path], _T], paths: Sequence[pathlib.Path]) 
 
 
 def list_remote(path: pathlib.Path, pattern: pathlib.Path | None = None) -> list[pathlib.Path]:
-    """List the files below a remote folder, or those below it that match a pattern.
+    """List the files below the remote folder `path`, or those below it that match `pattern`.
 
     Raises:
-        InputError: there is no such folder.
+        InputError: there is no such folder, or the address cannot be accessed.
     """
     with _opened(pattern or path) as (files, there):
         files.invalidate_cache()

@@ -25,16 +25,16 @@ def resize_image(
     antialias: bool = True,
     pixels: Literal["bytes", "floats"] = "bytes",
 ) -> Pixels:
-    """Resize an image, without keeping the aspect ratio.
+    """Resize an image to exactly `image_size`, whatever its aspect ratio.
 
     By default the filter is bilinear, and antialiased where the image shrinks: a triangle two
-    output pixels wide. Most public models were trained and evaluated with it, as Pillow's BILINEAR
-    and torchvision's Resize. The result is within one grey level of Pillow's, and so is that of
-    "bicubic" on bytes. (OpenCV's INTER_AREA is a box filter, several times further from Pillow on
-    photographs; its INTER_LINEAR aliases.) Floats equal torch's `interpolate` up to rounding, with
-    or without antialiasing.
-    Numpy resizes the first few images, for which loading numba (the `train` extra) does not pay,
-    and all without it: the result is bit-identical, but takes ten times as long.
+    output pixels wide. Most public models were trained and evaluated with this filter, which is
+    Pillow's BILINEAR and torchvision's Resize. The result is within one grey level of Pillow's, and
+    so is that of "bicubic" on bytes. (On photographs, OpenCV's INTER_AREA, a box filter, is several
+    times further from Pillow; its INTER_LINEAR aliases.) Floats equal torch's `interpolate` up to
+    rounding, with or without antialiasing.
+    Numpy resizes the first few images, because loading numba takes longer, and all images if numba
+    (the `train` extra) is missing. Its result is bit-identical, but takes ten times as long.
 
     Args:
         image: 8-bit RGB; with "floats" also float32.
@@ -43,8 +43,8 @@ def resize_image(
             INTER_LINEAR, as in hloc.
         antialias: whether the filter widens where the image shrinks. Without it "bicubic" is a
             little sharper, as in torch.
-        pixels: "bytes" are rounded after each pass, as in Pillow; "floats" are neither rounded nor
-            clamped nor rescaled.
+        pixels: "bytes" are rounded to uint8, as in Pillow; "floats" are neither rounded nor clamped
+            nor rescaled.
 
     Returns:
         The image at that size, of uint8 or float32.

@@ -62,23 +62,23 @@ class ImageSource(NamedTuple):
     """Images in order, and their names in descriptor files and maps."""
 
     root: pathlib.Path
-    """Folder that names are relative to."""
+    """Folder that the names are relative to; an address if the source is remote."""
     paths: list[pathlib.Path]
-    """Below the root; frames of videos and logs are named as in `data.frames`."""
+    """Files below the root; frames of videos and logs are named as in `data.frames`."""
     names: list[str]
-    """Posix paths relative to the root, each once."""
+    """Posix paths relative to the root, each once, in the order of `paths`."""
     positions: Positions | None = None
-    """From the columns of a table or a topic of a robot log; None without these."""
+    """Positions from the columns of a table or a topic of a robot log; None without these."""
 
     def located(self, given: Positions | Track | str | os.PathLike[str] | None = None) -> Positions:
         """Return where the images were taken, as far as known.
 
         Args:
-            given: see `positions_of`; None takes those of the source if it is a table, else those
-                in @UTM names, else the EXIF data of JPEGs.
+            given: positions by name, or a track, or their file (`positions_of`). None takes those
+                of the source, else those in @UTM names, else those in the EXIF data of JPEGs.
 
         Raises:
-            InputError: what `positions_of` raises.
+            InputError: `given` is not valid, or has no position of these images.
         """
         if given is not None:
             return positions_of(given, self.names, self.paths, self.root)
@@ -88,14 +88,14 @@ class ImageSource(NamedTuple):
         return found if found.of else exif_positions(pictures)
 
     def spaced(self, positions: Positions, metres: float) -> Self:
-        """Leave out images closer than `metres` to the last remaining one of their sequence.
+        """Leave out images closer than `metres` to the previous remaining one of their sequence.
 
-        A sequence is the images of a folder, or of a video, in order. Images without a position
-        stay.
+        A sequence is the images of a folder, a video or a topic of a log, in order. Images without
+        a position stay.
 
         Args:
             positions: where the images were taken.
-            metres: the smallest distance between two images.
+            metres: the smallest distance in metres between consecutive images.
 
         Raises:
             InputError: `metres` is not a distance, or no image has a position.
@@ -144,13 +144,13 @@ def open_source(
         topic: the topic of images in logs; None takes the only one.
         position_topic: the topic of positions in logs; None takes the only one of NavSatFix, else
             the only one of odometry or poses; "none" takes none.
-        on_bad_image: "skip" lists a missing file like the others, to be left out when it is read;
-            "stop" refuses it.
+        on_bad_image: "stop" refuses missing files; "skip" lists them like the others, to be left
+            out by the function that reads them.
 
     Returns:
-        The images. Names are relative to the folder; to that of the file; to the part of a pattern
-        before its first wildcard; to the folder of a list or table or, if a path leads out of it,
-        to the root of the file system.
+        The images. Names are relative to the given folder; to the folder of a file; to the part of
+        a pattern before its first wildcard; or to the folder of a list or table (if a path leads
+        out of that folder, to the root of the file system).
 
     Raises:
         InputError: no such source, no image in it, a repeated path, or a file that is missing or
@@ -206,7 +206,7 @@ def open_sources(
     """List the images of one or several sources, each as `open_source` does.
 
     Raises:
-        InputError: no source; or what `check_frames` or `open_source` raises.
+        InputError: no source, an option without effect, or a source that `open_source` refuses.
     """
     given = [images] if isinstance(images, str | os.PathLike) else list(images)
     if not given:
@@ -221,14 +221,14 @@ def join_sources(sources: Sequence[ImageSource]) -> ImageSource:
     """Join the images of several sources.
 
     Args:
-        sources: from `open_sources`.
+        sources: sources from `open_sources`.
 
     Returns:
-        The images. Those of several sources appear once each, named relative to a common folder.
-        They have positions if all positions of the sources are in the same axes and zone.
+        A single source as it is. Images of several sources appear once each, named relative to a
+        common folder, and have positions if all known positions share their axes and zone.
 
     Raises:
-        InputError: several sources, one of them at an address.
+        InputError: there are several sources, and one of them is at an address.
     """
     if len(sources) == 1:
         return sources[0]
@@ -324,7 +324,7 @@ def check_frames(
 
     Args:
         paths: the images of all sources.
-        fps: the rate; None if not given.
+        fps: frames per second; None if not given.
         topic: the topic of images in a log; None if not given.
         position_topic: the topic of positions in a log; None if not given.
 

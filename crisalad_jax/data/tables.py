@@ -1,6 +1,6 @@
-"""Read CSV tables, and match the names of images in tables and lists with files.
+"""Read CSV tables, and match the image names in tables and lists to files on disk.
 
-Windows writes backslashes between folders, and macOS writes accents as separate characters (NFD).
+Names may differ: Windows writes backslashes, and macOS writes accents as separate characters (NFD).
 """
 
 import collections
@@ -21,7 +21,7 @@ from crisalad_jax.utils.files import LARGEST, check_source
 AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
 """Names of a position's two coordinates: UTM metres, degrees, or metres in a custom frame."""
 MOST_METRES = 1e8
-"""Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+"""Largest coordinate in metres: 2.5 times the Earth's circumference, and its square is finite."""
 _LINE = 2**20
 """Characters after which a line is cut: the rest then has too many or too few fields."""
 _MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
@@ -38,19 +38,19 @@ _SPELLINGS = {
 
 
 def number_of(text: str) -> float:
-    """Convert a text to a decimal number, or NaN if it is not one; `float` would read 1_0 as 10."""
+    """Convert decimal text to a float, and other text to NaN; `float` would read 1_0 as 10."""
     plain = re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", text, re.ASCII | re.IGNORECASE)
     return float(text) if plain else math.nan
 
 
 class Row(NamedTuple):
-    """A row of a `Table`, with its fields by column."""
+    """A row of a `Table`: the text of each of its fields, by the name of the column."""
 
     path: pathlib.Path
     line: int
     fields: dict[str, str]
     has_commas: bool
-    """Whether decimals may have commas, because semicolons separate the fields."""
+    """Whether a comma may be the decimal mark, because semicolons separate the fields."""
 
     @property
     def where(self) -> str:
@@ -58,20 +58,20 @@ class Row(NamedTuple):
         return f"{self.path}: line {self.line}"
 
     def text(self, column: str) -> str:
-        """Return a field that must not be empty.
+        """Return the text in a column, which must not be empty.
 
         Raises:
-            InputError: it is empty.
+            InputError: the field is empty.
         """
         if not self.fields[column]:
             raise InputError(f"{self.where}: found no {column}, expected one")
         return self.fields[column]
 
     def number(self, column: str) -> float:
-        """Return a finite number; a field with both a comma and a point is refused.
+        """Return the finite number in a column; a field with both a comma and a point is refused.
 
         Raises:
-            InputError: the field is not a number, or is larger than a position can be.
+            InputError: the field is not a number, or is out of range for a position.
         """
         text, most = self.fields[column], _MOST.get(column, math.inf)
         value = number_of(text.replace(",", ".") if self.has_commas and "." not in text else text)
@@ -86,20 +86,20 @@ class Table(NamedTuple):
 
     path: pathlib.Path
     columns: list[str]
-    """The first row, without spaces around its fields."""
+    """Fields of the first row without spaces around them; see `read_table` for other spellings."""
     lines: Iterator[tuple[int, list[str]]]
-    """Line number and fields of each further row, a field per column; can be iterated once."""
+    """Line number and fields of each later row, one field per column; can be iterated once."""
     has_commas: bool
 
     def axes(self, of: str, *, must: bool) -> tuple[str, str] | None:
-        """Return the columns of positions; None if there are none.
+        """Return the names of the two columns of positions, one of `AXES`; None without positions.
 
         Args:
-            of: the column that identifies the rows, for the message.
+            of: name of the column that identifies the rows, for the message.
             must: whether positions are required.
 
         Raises:
-            InputError: both east,north and lat,lon; half a pair; or none although it is required.
+            InputError: both east,north and lat,lon; half of such a pair; or none if `must`.
         """
         # x and y may be anything, such as pixels, and count only if there is no other pair.
         begun = [axes for axes in AXES[:2] if set(axes) & set(self.columns)]
@@ -115,16 +115,16 @@ class Table(NamedTuple):
         return None
 
     def rows(self) -> Iterator[Row]:
-        """Yield the rows with their fields by column, without spaces around them."""
+        """Yield each row, without spaces around its fields."""
         for line, fields in self.lines:
             by_column = dict(zip(self.columns, map(str.strip, fields), strict=True))
             yield Row(self.path, line, by_column, self.has_commas)
 
     def named_rows(self) -> Iterator[tuple[str, Row]]:
-        """Yield each image's name and row; video frames are named as in `data.frames`.
+        """Yield the name and row of each image, with frames of videos named as in `data.frames`.
 
         Raises:
-            InputError: a row has no name, or the name of an earlier row, however it is spelled.
+            InputError: a row has no name, or that of an earlier row, compared by `normal_name`.
         """
         lines: dict[str, int] = {}
         for row in self.rows():
@@ -139,18 +139,18 @@ class Table(NamedTuple):
 def read_table(path: pathlib.Path, *needed: str, any_spelling: bool = False) -> Table:
     """Read a table whose first row has the names of the columns.
 
-    The separator is a comma or, if the header has more of them, a semicolon. A spreadsheet's byte
-    order mark is dropped.
+    The separator is a semicolon if the first row has more semicolons than commas, and otherwise a
+    comma. A byte order mark, as spreadsheets write it, is dropped.
 
     Args:
-        path: the file.
-        *needed: required columns; without any, the first row may be data like the others.
+        path: the file, local or remote.
+        *needed: required columns; if none are given, the first row may hold data instead of names.
         any_spelling: whether columns may be in capitals, or have other usual names such as
             latitude; they are then renamed to name, lat, lon, east, north and time.
 
     Raises:
-        InputError: the file cannot be read, lacks a column or has one twice, or the number of
-            fields in a row differs from the header's.
+        InputError: the file cannot be read, or lacks a required column or has one twice; or, while
+            its rows are read, one does not have as many fields as the first row.
     """
     if not is_remote(path):
         check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
@@ -214,9 +214,9 @@ def spellings(names: Collection[str]) -> dict[str, str]:
 
 
 def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
-    """Map each name to the existing name that matches it; names without a match are left out.
+    """Map each name to the one in `there` that matches it; names without a match are left out.
 
-    The match is the name itself, or else one that differs only in slashes or normal form.
+    The match is the name itself, or else one that differs only in slashes or Unicode normal form.
     """
     existing = spellings(there)
     found = {name: existing.get(name, existing.get(normal_name(name))) for name in names}
@@ -224,7 +224,7 @@ def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
 
 
 class Disk:
-    """A finder of files that lists each folder once: a stat per file is slow on remote disks."""
+    """A finder of files that lists each folder only once, which is faster on remote disks."""
 
     def __init__(self, root: pathlib.Path | None = None) -> None:
         """Start without listings, or with those of all folders below a remote root.

@@ -29,12 +29,12 @@ _Point = tuple[object, Any, Any]
 
 @brief
 class Track(NamedTuple):
-    """Positions over time."""
+    """Positions over time: `points[i]` has the two coordinates at `times[i]`."""
 
     source: str
     """The file, for messages."""
     axes: tuple[str, str]
-    """Names of the two coordinates, as in `Positions`."""
+    """Names of the two coordinates, one of `tables.AXES`."""
     times: Float64[np.ndarray, " point"]
     """Seconds since 1970, ascending."""
     points: Float64[np.ndarray, "point 2"]
@@ -52,8 +52,8 @@ class Track(NamedTuple):
             times: times in seconds since 1970.
 
         Returns:
-            The positions, NaN before the first point and after the last one; and for each the
-            seconds between the two track points around it, 0 at a point.
+            The positions, NaN before the first point and after the last one; and for each position
+            the seconds between the two track points around it, 0 at a point.
 
         Example:
             >>> import numpy as np
@@ -80,7 +80,7 @@ def is_track(path: str | os.PathLike[str]) -> bool:
     """Return whether a file lists positions by time rather than by the names of images.
 
     Raises:
-        InputError: a table that cannot be read.
+        InputError: the file is a table, and cannot be read.
     """
     path = pathlib.Path(path)
     if path.suffix.lower() in (".gpx", *_GEOJSON):
@@ -94,14 +94,14 @@ def read_track(
 ) -> Track:
     """Read a track: GPX, GeoJSON, or a table with a column `time` and positions.
 
-    Times are ISO 8601, in UTC if they have no zone, or numbers of seconds, milliseconds,
-    microseconds or nanoseconds since 1970, which are distinguished by their size.
+    Times are ISO 8601, in UTC if they have no zone, or numbers since 1970: seconds, milliseconds,
+    microseconds or nanoseconds, which are distinguished by their size.
 
     Args:
         path: the file. A .gpx has track points with times. A .geojson or .json has lines with
             `coordTimes` or `times`, or points with `time`. A table has the columns time and
             lat,lon or east,north or x,y, or other usual names of these.
-        start_time: when the images' video began, with the zone: "2026-05-01T12:00:00+02:00".
+        start_time: start and time zone of the images' video, if any: "2026-05-01T12:00:00+02:00".
         time_offset: seconds that are added to the times of images, for cameras whose clock is wrong
             or shows local time: -7200 if it is two hours ahead of UTC.
 
@@ -109,8 +109,8 @@ def read_track(
         The track, which `index` takes as `positions`.
 
     Raises:
-        InputError: the file cannot be read; it has no points, points without times, times that go
-            back, or positions out of range; a start without a time zone, or an infinite offset.
+        InputError: the file cannot be read; it has no points, points out of range or without times,
+            or times that go back; `start_time` has no zone, or `time_offset` is not finite.
 
     Example:
         >>> text = "time,lat,lon\\n2026-05-01T10:00:00Z,52.2,21.0\\n2026-05-01T10:00:10Z,52.3,21.0"
@@ -146,7 +146,7 @@ def read_track(
 
 
 def utc(seconds: Any) -> str:
-    """Format the seconds since 1970 for a message.
+    """Format a time in seconds since 1970 as ISO 8601 in UTC, for a message.
 
     Example:
         >>> utc(1777629600.25)
@@ -156,10 +156,10 @@ def utc(seconds: Any) -> str:
 
 
 def time_of(text: str) -> float:
-    """Convert ISO 8601 to seconds since 1970, as UTC if it has no zone.
+    """Convert a time in ISO 8601, taken as UTC if it has no zone, to seconds since 1970.
 
     Raises:
-        ValueError: it is not a time.
+        ValueError: the text is not a time.
     """
     time = datetime.datetime.fromisoformat(text)
     return (time if time.tzinfo else time.replace(tzinfo=datetime.UTC)).timestamp()

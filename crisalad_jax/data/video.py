@@ -1,8 +1,8 @@
 """Frames of video files, named as in `data.frames`: `walk.mp4#t=12.500`.
 
-Times are those in the file, so a variable frame rate does no harm. Every command names a frame by
-its actual time in whole milliseconds, however a user wrote it: `frame_name` writes the name,
-`milliseconds_of` reads the time, `name_frame` finds the frame.
+Times are those in the file, so videos with a variable frame rate work too. Commands name a frame by
+its actual time in whole milliseconds, even if a user wrote a time between two frames: `frame_name`
+writes such a name, and `name_frame` makes it from the user's.
 """
 
 import bisect
@@ -33,21 +33,21 @@ _BEFORE_KEY = 2_000
 
 
 def milliseconds_of(capture: cv2.VideoCapture) -> int:
-    """Read the time of a video's current frame."""
+    """Return the time in milliseconds of the frame that was read last from a video."""
     return round(capture.get(cv2.CAP_PROP_POS_MSEC))
 
 
 def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib.Path]:
     """List the first frame of a video at or after each multiple of 1 / fps seconds.
 
-    The times are read from the container. Nothing is decoded.
+    Times are read from the container; only the end is decoded, as a check, or all if that fails.
 
     Args:
         video: the file.
-        fps: frames per second (see `check_rate`); a rate above the video's lists all.
+        fps: frames per second, above 0; a rate above that of the video lists all frames.
 
     Returns:
-        Names of frames, which `read_image` reads.
+        Names of the frames in order of time, which `read_image` reads.
 
     Raises:
         InputError: the file is missing, or is not a video.
@@ -66,13 +66,13 @@ def count_frames(video: str | os.PathLike[str]) -> int:
 
 
 def name_frame(frame: FrameName) -> pathlib.Path:
-    """Name a frame by its actual time; between two frames, name the one that `read_frame` reads.
+    """Return the name of a frame with its actual time; between two frames, name the later one.
 
     Args:
-        frame: a frame of a video.
+        frame: a video and a time in it.
 
     Returns:
-        The name. A time after the video's last frame is unchanged, for the reader to report.
+        The name. A time after the last frame is unchanged; `read_frame` then raises an error.
 
     Raises:
         InputError: the video is missing or does not decode.
@@ -157,7 +157,7 @@ def _as_of(file: str, size: int, changed: int) -> _Video:
 def read_frame(frame: FrameName) -> UInt8[np.ndarray, "h w 3"]:
     """Read a frame as 8-bit RGB, upright: the first one at or after the time in its name.
 
-    Reading frames in order of time avoids seeking, so one thread should read a video.
+    Reading frames in order of time avoids seeking, so only one thread should read a given video.
 
     Raises:
         InputError: the file is not a video, or has no such frame.

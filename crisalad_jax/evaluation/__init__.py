@@ -1,1 +1,1 @@
-"""Evaluation of descriptors: recalls under each grouping, and the leakage of a grouping."""
+"""Evaluation of descriptors: recall under each grouping of images into batches, and its leakage."""

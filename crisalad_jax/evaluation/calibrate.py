@@ -36,26 +36,26 @@ def calibrate(
 ) -> Calibration:
     """Measure the similarity threshold at which answers reach a precision, and store it in the map.
 
-    The set is evaluated with the map's model, image size and components, each image independently,
-    as in `query`. The map's own images are not used. So the set's database should show the map's
-    places, or about as many similar places, and its queries should be like those that the map will
+    The benchmark is evaluated with the map's model, image size and PCA, each image independently as
+    in `query`. The map's own images are not used, so the benchmark's database should show the map's
+    places, or about as many similar ones, and its queries should be like those that the map will
     get. Include queries of unknown places: they count as wrong when answered.
 
     Args:
         places: the open map; the result is stored in its folder and replaces an earlier one.
-        benchmark: the set, for instance from `open_benchmark`.
+        benchmark: the evaluation set, for instance from `open_benchmark`.
         precision: share of the answers that must be correct, above 0 and at most 1.
         model: the model that made the map; None loads it from its recorded path (`Map.load_model`).
-        verify: how to verify answers, to measure the number of inliers that they need (stored
-            separately); None measures the similarity.
+        verify: how answers are verified. The number of inliers that they need is then measured, and
+            stored separately, instead of the similarity. None measures the similarity.
         reading: how images are read.
 
     Returns:
         The calibration that the map now stores.
 
     Raises:
-        InputError: no similarity reaches the precision, or it rests on too few answers (the map is
-            then unchanged); parameters of another model; or what `evaluate` raises.
+        InputError: no threshold reaches the precision with at least three answers (the map is then
+            unchanged); `model` is not the map's; or what `evaluate` raises.
 
     Example:
         >>> import jax, shutil
@@ -115,7 +115,7 @@ def calibrate(
 
 
 def operating_point_of(calibration: Calibration) -> OperatingPoint:
-    """Return a map's stored calibration as an operating point."""
+    """Convert a calibration to an operating point; if verified, its similarities are inliers."""
     measured = {name: getattr(calibration, name) for name in _MEASURED}
     if calibration.verifier:
         measured["min_similarity"] = calibration.min_inliers

@@ -13,15 +13,15 @@ RESAMPLES = 10_000
 
 
 class Difference(NamedTuple):
-    """A method's recall minus the reference's, as fractions of the same queries."""
+    """The recall of a method minus that of a reference, as fractions of the same queries."""
 
     mean: float
-    """Difference of the means over the seeds."""
+    """Difference of the mean recalls, each over all seeds of the method or the reference."""
     interval: Interval
-    """95 % interval of the difference, over queries and seeds."""
+    """95 % bootstrap interval of the difference, resampled over queries and seeds."""
 
     verdict: Literal["better", "worse", "inconclusive"]
-    """What the interval shows: "better" or "worse" if it excludes 0."""
+    """What the interval shows: "better" if it is above 0, "worse" if below, else "inconclusive"."""
 
 
 def paired_difference(
@@ -34,16 +34,16 @@ def paired_difference(
 ) -> Difference:
     """Compute the difference of two recalls, and its 95 % interval by percentile bootstrap.
 
-    A resample draws as many queries and seeds as there are, with replacement, the same queries for
-    both methods. Runs of one seed share initial values and batches, so the same seeds are drawn for
-    both, and their common effect cancels. Queries with the same hits are drawn together from a
-    multinomial distribution, which is exact and takes no longer with more queries.
+    Each resample draws queries and seeds with replacement, as many as there are. Both methods get
+    the same queries. They also get the same seeds, because two runs with one seed share initial
+    values and batches, whose effect then cancels. Queries with equal hits are drawn together from a
+    multinomial distribution, which is exact and whose cost does not grow with their number.
 
     Args:
         hits: whether each query was a hit, for each seed of the method.
-        reference: hits of the reference, on the same queries.
-        same_seeds: whether row i of both is a run of the same seed. If not, as for a model from a
-            file, the seeds of each method are drawn independently.
+        reference: the same for the reference method, on the same queries.
+        same_seeds: whether row i of both arrays is a run of the same seed. If not, as for a model
+            from a file, the seeds of each method are drawn independently.
         resamples: number of resamples.
         seed: seed of the resampling; the same seed gives the same interval.
 
@@ -51,8 +51,8 @@ def paired_difference(
         The difference, positive if the method recalls more.
 
     Raises:
-        InputError: no queries or seeds, other queries than the reference's, or different numbers of
-            seeds with `same_seeds`.
+        InputError: no queries or seeds, different numbers of queries, or with `same_seeds`
+            different numbers of seeds.
 
     Example:
         >>> first, second = np.array([[True, True, True, False]]), np.array([[False] * 4])

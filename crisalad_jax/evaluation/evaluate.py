@@ -40,7 +40,7 @@ from crisalad_jax.utils.errors import InputError
 KS = (1, 5, 10, 20)
 
 Observe = Callable[[str, Descriptors, Descriptors], None]
-"""Takes the name of a grouping, the database descriptors, and the query descriptors."""
+"""A function of the name of a grouping, the database descriptors, and the query descriptors."""
 
 
 @takes(benchmark=Benchmark)
@@ -58,23 +58,23 @@ def evaluate(
     precision: float | None = None,
     reading: Reading = Reading(),
 ) -> list[GroupingResult]:
-    r"""Measure Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
+    r"""Measure Recall@1, 5, 10 and 20, precision and leakage of a model under each grouping.
 
-    Whether two queries or two database images show the same place is decided by the benchmark's
-    positions, or without positions by its ground truth (`evaluation.leakage`).
-
-    A model without a cross-image encoder has one grouping, `any`: its descriptors do not depend on
-    the batch. The tokens of all images are held in memory, and the descriptors of one grouping and
-    seed at a time.
+    A grouping says which images attend to each other in a cross-image encoder. A model without one
+    has a single grouping, `any`. Leakage is how much the other images of a batch reveal about the
+    place of an image. Whether two images show the same place is decided by the positions of the
+    benchmark or, without positions, by its ground truth. Images are read and turned into tokens
+    once; memory holds all tokens, and the descriptors of one grouping and seed at a time.
 
     Args:
         model: a model from `load`, or a `Runtime`.
         benchmark: the evaluation set.
-        groupings: each as `Grouping.parse` reads it, or `published:NAME` with cricavpr, crisalad or
-            sage: the batches of that paper, then single, shuffled and masked ones of its size.
+        groupings: each as `Grouping.parse` reads it, such as "single"; or "published:NAME", where
+            NAME is cricavpr, crisalad or sage, for the batches of that paper, followed by single
+            images and by shuffled and masked batches of the same size.
         seed: seed of the first shuffle of the database; the queries use the next seed.
-        seeds: number of shuffles, whose seeds are two apart.
-        pca: components that shorten the descriptors, fitted to other places.
+        seeds: number of shuffles of a grouping with `shuffled`, by `seed`, `seed` + 2 and so on.
+        pca: principal components that shorten the descriptors, fitted to other places.
         dtype: how descriptors are compared; "bits" compares their signs (`pack_bits`) by the
             Hamming distance.
         observe: called with the descriptors of each grouping's first seed; for bits, with unit
@@ -83,18 +83,18 @@ def evaluate(
         precision: adds an `operating_point` to each result: the similarity threshold at which first
             retrievals reach this precision, and the recall that remains.
         reading: how images are read; its batch size is the number of images that attend to each
-            other. With "skip" the results are for the set without unreadable images
-            (`GroupingResult.skipped`).
+            other, unless a grouping has its own. With `on_bad_image` "skip" the results are for the
+            benchmark without unreadable images (`GroupingResult.skipped`).
 
     Returns:
         A result for each grouping, and with `rerank` a second one.
 
     Raises:
-        InputError: parameters of another configuration; bits of a length that is not a multiple of
-            8; no ground truth; an unreadable image, or no readable query or database image;
-            components that are not for this model or give no unit vectors; a precision out of
-            range; a published grouping whose batches are not known for this set; or what
-            `Grouping.parse`, `Reranking.check` and `Reranking.stage` raise.
+        InputError: parameters that do not fit the configuration; components of another model; bits
+            of a length that is not a multiple of 8; no ground truth; an unreadable image, or no
+            readable query or database image; a number out of range; an unknown grouping, or a
+            published one without batches for this set; or a second stage that does not fit
+            (`Reranking.check` and `stage`).
 
     Example:
         >>> import jax, shutil
@@ -173,10 +173,10 @@ def evaluate(
 def check_evaluation(
     groupings: Sequence[str], *, seed: int, seeds: int, precision: float | None
 ) -> list[str]:
-    """Check arguments of `evaluate` before any work, and return the kinds of groupings.
+    """Check arguments of `evaluate`, and return the kinds of groupings in them, such as "single".
 
     Raises:
-        InputError: what `check_groupings` raises, or a number out of range.
+        InputError: an unknown grouping, or a number out of range.
     """
     check_seed("seed", seed)
     check_count("seeds", seeds)
@@ -207,7 +207,7 @@ class _Side(NamedTuple):
 
 
 def same_place_rule(benchmark: Benchmark) -> str:
-    """Describe how `evaluate` decides that two images of a side show the same place."""
+    """Describe how `evaluate` decides if two queries, or two database images, share a place."""
     if benchmark.query_positions is None or benchmark.database_positions is None:
         return "a common positive"
     return f"a distance of at most {benchmark.radius:g} m"

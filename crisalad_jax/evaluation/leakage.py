@@ -11,7 +11,7 @@ from crisalad_jax.retrieval.grouping import MASKED, Batches
 SamePlace = Callable[
     [Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]], Bool[np.ndarray, " pair"]
 ]
-"""Tests, for each pair of image indices of one side, whether both show the same place."""
+"""Tests which pairs of queries, or of database images, show the same place; takes indices."""
 
 # Elements in an array of pairs: tens of megabytes, for any number of images.
 _CHUNK = 2**21
@@ -29,11 +29,11 @@ def near(positions: Float64[np.ndarray, "image axis"], radius: float) -> SamePla
 def by_truth(
     positives: Sequence[Int64[np.ndarray, " _"]], database: int
 ) -> tuple[SamePlace, SamePlace]:
-    """Return same-place tests for the queries and the `database` images, from ground truth only.
+    """Return tests of whether two queries, or two of the `database` images, show the same place.
 
-    Two queries show the same place if some database image is correct for both, and two database
-    images if both are correct for some query. An image without positives shares its place with no
-    other image, whatever it shows.
+    The tests use only ground truth: two queries show the same place if some database image is
+    correct for both, and two database images if both are correct for some query. An image without
+    a match in the ground truth shares its place with no other image, whatever it shows.
     """
     truth = _truth(positives, database)
     return _sharing(truth), _sharing(truth.T.tocsr())
@@ -60,14 +60,14 @@ def _sharing(owned: scipy.sparse.csr_array) -> SamePlace:
 
 
 def masked(batches: Batches, same: SamePlace) -> Batches:
-    """Let each image attend only to those images of its batch that show other places.
+    """Let each image attend only to itself and to images of its batch that show other places.
 
     Each image gets its own batch. In a shared batch with a mask, an image would still see others of
     its place in the second layer, through a third image.
 
     Args:
-        batches: batches without discarded slots.
-        same: whether two images show the same place.
+        batches: batches in which all images are kept (`Batches.kept`), as in `sequential`.
+        same: test of whether two images show the same place.
     """
     batch, place = np.nonzero(batches.kept)
     images, filled = batches.images[batch], batches.filled[batch].copy()
@@ -84,11 +84,11 @@ def mirrored_share(
 ) -> float | None:
     """Measure how closely a query's batch mirrors the batch of its correct answer, 0 to 1.
 
-    This is the share of the other images in a query's batch that have a positive in the batch of
-    the query's own positive; of several positives, the largest share counts. If the files of both
-    sides are in the same order it is 1: both batches hold the same places, and what their images
-    share identifies that part of the sequence. It is averaged over the queries with a positive that
-    attend to other images; None if there are none, or if no database image attends to another.
+    For a query and one of its positives, this is the share of the other queries in its batch that
+    have a positive in the batch of that positive; the positive with the largest share counts. It is
+    1 if queries and database have the same file order: both batches then show the same places, and
+    what their images share identifies that part of the sequence. The result is the mean over
+    queries with a positive that attend to others; None without any, or if a grouping is `single`.
     """
     if "single" in (queries.grouping, database.grouping):
         return None
@@ -114,9 +114,9 @@ def _sight(batches: Batches) -> scipy.sparse.csr_array:
 
 
 def same_place_share(batches: Batches, same: SamePlace) -> float | None:
-    """Measure the share of the other images in a batch that show an image's own place, 0 to 1.
+    """Measure the share of same-place images among the others that an image attends to, 0 to 1.
 
-    The share is averaged over all images that attend to another one; None if none does.
+    The result is the mean over images that attend to another one; None if none does.
     """
     if batches.grouping == "single":
         return None

@@ -1,6 +1,6 @@
 """Recall@K with confidence intervals, and precision-recall.
 
-This is the public protocol of visual place recognition: a recall counts every query.
+As is usual in visual place recognition, recall counts every query, even those without a match.
 """
 
 from collections.abc import Sequence
@@ -44,8 +44,8 @@ def recalls(
 ) -> dict[int, float]:
     """Compute Recall@K: the share of **all** queries with a positive among their top K.
 
-    A query without positives is a miss. If K exceeds the number of columns, all of them count:
-    `search` with max(ks) returns fewer only if the database is smaller.
+    A query without positives is a miss. If K exceeds the number of columns, all columns count:
+    `search` for max(ks) neighbours returns fewer only if the database is smaller.
 
     Args:
         indices: database indices of each query's neighbours, best first.
@@ -53,10 +53,10 @@ def recalls(
         ks: the values of K.
 
     Returns:
-        The fraction of the queries, 0 to 1, by K.
+        Fractions of the queries, 0 to 1, by K.
 
     Raises:
-        InputError: a K below 1, or what `right_retrievals` raises.
+        InputError: a K below 1; no queries; or `positives` that do not fit (`right_retrievals`).
     """
     for k in ks:
         check_count("ks", k)
@@ -85,7 +85,7 @@ def bootstrap_interval(hits: Int[np.ndarray, " q"], trials: int = 1) -> Interval
 
     Args:
         hits: number of trials in which each query was a hit.
-        trials: number of trials, such as seeds; the interval does not include their spread.
+        trials: number of trials per query, such as seeds; their spread is not in the interval.
 
     Raises:
         InputError: no queries, or a hit below 0 or above `trials`.
@@ -109,11 +109,11 @@ def bootstrap_interval(hits: Int[np.ndarray, " q"], trials: int = 1) -> Interval
 class PrecisionRecall(NamedTuple):
     """Precision and recall of accepting first retrievals by similarity, strictest threshold first.
 
-    They matter for loop closure, where a single accepted wrong retrieval can spoil a map.
+    Such curves matter for loop closure, where one accepted wrong retrieval can spoil a map.
     """
 
     thresholds: Float[np.ndarray, " threshold"]
-    """The similarities of first retrievals; one is accepted at or above the threshold."""
+    """Distinct similarities of first retrievals, descending; at or above one, all are accepted."""
     precision: Float64[np.ndarray, " threshold"]
     """Share of the accepted queries whose first retrieval is correct."""
     recall: Float64[np.ndarray, " threshold"]
@@ -127,15 +127,15 @@ class PrecisionRecall(NamedTuple):
 def accepted(
     similarities: Float[np.ndarray, " q"], right: Bool[np.ndarray, " q"]
 ) -> tuple[Float[np.ndarray, " q"], Int64[np.ndarray, " t"], Int64[np.ndarray, " t"]]:
-    """Accept queries by the similarity of their first retrieval, strictest threshold first.
+    """Count accepted queries at each threshold on the similarity of their first retrieval.
 
     Args:
         similarities: similarities of the first retrievals.
         right: which first retrievals are correct.
 
     Returns:
-        The similarities in descending order; and for each threshold, the index in them of the last
-        accepted query, and the number of accepted queries that are correct.
+        The similarities in descending order. Then, for each distinct one as the threshold, the
+        index in that order of the last accepted query, and how many accepted ones are correct.
 
     Raises:
         InputError: a similarity is NaN.
@@ -156,8 +156,8 @@ def precision_recall(
 
     This is the single-best-match evaluation of Schubert et al. 2024, "Visual Place Recognition: A
     Tutorial", at every possible threshold. Queries of equal similarity are accepted together.
-    Accepting a query without positives is always wrong, and such queries do not count in recall. If
-    there are any, Recall@1, which is over all queries, is lower than the last recall here.
+    Accepting a query without positives is always wrong. The recall here leaves such queries out, so
+    with any of them its last value is higher than Recall@1, which is over all queries.
 
     Args:
         indices: database indices of each query's neighbours, best first; only the first counts.
@@ -168,7 +168,7 @@ def precision_recall(
         The curve, or None if no query has a positive, since recall is then undefined.
 
     Raises:
-        InputError: a similarity is NaN, or what `right_retrievals` raises.
+        InputError: a similarity is NaN; no queries; or `positives` that do not fit.
     """
     right = right_retrievals(indices[:, :1], positives)[:, 0]
     answerable = sum(np.size(wanted) > 0 for wanted in positives)

@@ -16,26 +16,26 @@ CONFIDENCE = 0.95
 
 
 class OperatingPoint(NamedTuple):
-    """Outcome of accepting first retrievals at or above some similarity.
+    """Outcome of accepting first retrievals at or above a threshold on their similarity.
 
-    If no similarity reaches the requested precision, this is the point of highest precision, and
+    If no threshold reaches the requested precision, the one with the highest precision is used, and
     `reached` is False.
     """
 
     asked: float
     """The requested precision, as a fraction."""
     min_similarity: float
-    """A first retrieval is accepted at this similarity or above it."""
+    """The threshold: a first retrieval is accepted at this similarity or above it."""
     answered: int
     """Number of queries whose first retrieval is accepted."""
     right: int
-    """Number of these whose first retrieval is correct."""
+    """Number of answered queries whose first retrieval is correct."""
     queries: int
     """Number of all queries."""
     unknown: int
     """Number of queries without a positive: places that the database does not have."""
     unknown_answered: int
-    """Number of these that are accepted anyway, each of them wrongly."""
+    """Number of queries of unknown places that are accepted anyway, each of them wrongly."""
 
     @property
     def precision(self) -> float:
@@ -46,8 +46,8 @@ class OperatingPoint(NamedTuple):
     def lower_bound(self) -> float:
         """Lower end of the one-sided 95 % interval of the precision by Clopper and Pearson 1934.
 
-        Queries are treated as independent, and the similarity as fixed in advance. It was chosen on
-        the same queries, so the bound is somewhat too high.
+        Queries are treated as independent, and the threshold as fixed in advance. In fact it was
+        chosen on the same queries, so the bound is somewhat too high.
         """
         if not self.right:
             return 0.0
@@ -81,7 +81,7 @@ def operating_point(
     positives: Sequence[Int[np.ndarray, " _"]],
     precision: float,
 ) -> OperatingPoint:
-    """Choose the similarity that gives the highest recall at a precision.
+    """Choose the similarity threshold with the highest recall at a given precision.
 
     The candidates are the thresholds of `precision_recall`. Queries of equal similarity are
     accepted together. Accepting a query without positives is always wrong. Recall is over all
@@ -94,11 +94,11 @@ def operating_point(
         precision: share of accepted first retrievals that must be correct, above 0 and at most 1.
 
     Returns:
-        The lowest such similarity, rounded down to the fewest decimals that accept the same
-        queries; if none reaches the precision, the one with the highest precision.
+        The outcome at the lowest threshold that reaches the precision, or else at the most precise
+        one; it is rounded down to the fewest decimals, three or more, that accept the same queries.
 
     Raises:
-        InputError: a precision out of range, a NaN similarity, or what `right_retrievals` raises.
+        InputError: a precision out of range; a NaN; no queries; or `positives` that do not fit.
 
     Example:
         >>> import numpy as np
@@ -140,7 +140,7 @@ def _rounded_down(value: float, below: float) -> float:
 
 
 def to_json(point: OperatingPoint) -> dict[str, Any]:
-    """Convert an operating point to JSON values by name."""
+    """Convert the fields and properties of an operating point to JSON values by name."""
     names = ("precision", "lower_bound", "recall", "reached")
     return point._asdict() | {name: getattr(point, name) for name in names}
 
@@ -150,7 +150,7 @@ _FEWEST = 3
 
 
 def check_supported(point: OperatingPoint, source: str) -> None:
-    """Check that a similarity rests on enough answers; `caveats` says what it shows.
+    """Check that an operating point rests on at least three answers; see also `caveats`.
 
     Args:
         point: the operating point.
@@ -169,7 +169,7 @@ def check_supported(point: OperatingPoint, source: str) -> None:
 
 
 def caveats(point: OperatingPoint) -> list[str]:
-    """Describe what an operating point does not show; nothing if it shows what was requested.
+    """Describe why an operating point may miss the requested precision; empty if nothing is wrong.
 
     Each caveat is at most one line, and starts in lower case so that it can follow a name.
     """

@@ -1,4 +1,4 @@
-"""How published evaluations group images, by the name of their method."""
+"""How published evaluations group images into batches, by the name of their method."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,20 +13,20 @@ PREFIX = "published:"
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """The batches of a published evaluation: images in the order of their names, sides separate."""
+    """Batches of a published evaluation: images in order of name, queries and database separate."""
 
     sizes: Mapping[str, int]
-    """Batch size, by a lower-case part of the set's name."""
+    """Batch size, by a lower-case part of the evaluation set's name."""
     otherwise: int | None
-    """Batch size for any other set; None if unknown."""
+    """Batch size for any other evaluation set; None if unknown."""
     source: str
-    """Where these sizes are from."""
+    """Where the sizes are published."""
 
     def batch_size(self, name: str, benchmark: Benchmark) -> int:
-        """Return the batch size for a set.
+        """Return the batch size for a benchmark; messages call the protocol `name`.
 
         Raises:
-            InputError: no size is known for the set, or its images are in another order.
+            InputError: no size is known for it, or its images are not in the order of their names.
         """
         words = benchmark.name.lower()
         size = next((n for key, n in self.sizes.items() if key in words), self.otherwise)
@@ -59,10 +59,10 @@ PROTOCOLS: Mapping[str, Protocol] = {
 
 
 def check_groupings(texts: Sequence[str]) -> list[str]:
-    """Check groupings, including published ones, and return the kinds of `Grouping` in them.
+    """Check groupings, also published ones, and return the kinds in them, such as "shuffled".
 
     Raises:
-        InputError: what `parse_groupings` raises, or there is no such published grouping.
+        InputError: a text that `Grouping.parse` does not read, or an unknown published grouping.
     """
     for text in texts:
         if text.startswith(PREFIX):
@@ -72,7 +72,7 @@ def check_groupings(texts: Sequence[str]) -> list[str]:
 
 
 def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
-    """Make the groupings of an evaluation, in order and without repeats.
+    """Parse the groupings of an evaluation, in order and without repeats.
 
     A published grouping is followed by single images, and by shuffled and masked batches of the
     same size.
@@ -82,7 +82,7 @@ def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
         benchmark: the evaluated benchmark.
 
     Raises:
-        InputError: what `Protocol.batch_size` raises.
+        InputError: a published grouping that does not fit the benchmark (`Protocol.batch_size`).
 
     Example:
         >>> import pathlib
@@ -106,7 +106,7 @@ def _expanded(texts: Sequence[str], size_of: Callable[[str], int]) -> Iterator[s
 
 
 def protocol_notes(texts: Sequence[str]) -> list[str]:
-    """Return the source of the batch sizes of each published grouping, one line each."""
+    """Explain each published grouping among the texts in one line, with its source."""
     names = [text.removeprefix(PREFIX) for text in texts if text.startswith(PREFIX)]
     return [
         f"{PREFIX}{name}: batches in the order of names, each side separately "

@@ -1,4 +1,4 @@
-"""Settings of an evaluation, as JSON and as text: without them its recalls mean nothing."""
+"""Settings of an evaluation, as JSON and as text, without which its recalls mean nothing."""
 
 import os
 from collections.abc import Sequence
@@ -27,9 +27,9 @@ class Record(NamedTuple):
     settings: dict[str, Any]
     """All settings that decide the results, as JSON values by name."""
     notes: list[str]
-    """What `table_notes` returns."""
+    """Paragraphs that explain the tables, from `table_notes`."""
     values: dict[str, Any]
-    """The settings and the results, as JSON values by name."""
+    """The settings, the results and the skipped images, as JSON values by name."""
 
 
 def evaluation_record(
@@ -46,13 +46,13 @@ def evaluation_record(
         results: what `evaluate` returned.
         benchmark: the evaluated benchmark.
         config: the model's configuration.
-        model_name: name of the weights, for each row.
+        model_name: name of the model, written into each result.
         **asked: the options of `crisalad evaluate`: the files `weights` (None for an untrained
-            model), `pca` and `rerank_weights` (None for those of the first stage), `groupings`,
-            `batch_size`, `seed`, `seeds`, `dtype` and `rerank`.
+            model), `pca`, and `rerank_weights` (None for the weights of the first stage); and
+            `groupings`, `batch_size`, `seed`, `seeds`, `dtype` and `rerank`.
 
     Returns:
-        The record; `write_report` takes its settings.
+        The record, whose settings `write_report` takes.
 
     Example:
         >>> import shutil
@@ -93,7 +93,7 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
 
     Args:
         results: what `evaluate` returned.
-        settings: settings of a `Record`.
+        settings: the settings in the `Record` of these results.
 
     Returns:
         The paragraphs.

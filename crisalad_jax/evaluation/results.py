@@ -29,14 +29,14 @@ ANY = "any"
 
 
 class Scores(NamedTuple):
-    """Scores of a ranking, or their spread over several rankings."""
+    """Scores of a ranking of all queries, or their standard deviation over several rankings."""
 
     recalls: Mapping[int, float]
     """Recall@K as a fraction, by K."""
     average_precision: float | None
-    """See `PrecisionRecall`; None if no query has a positive."""
+    """Area under the curve of `PrecisionRecall`; None if no query has a positive."""
     recall_at_full_precision: float | None
-    """See `PrecisionRecall`; None if no query has a positive."""
+    """Largest recall without a wrong retrieval; None if no query has a positive."""
 
 
 @brief
@@ -47,7 +47,7 @@ class Skipped(NamedTuple):
     database: tuple[int, ...] = ()
 
     def rest_of(self, benchmark: Benchmark) -> Benchmark:
-        """Return the benchmark without these images, to which the results refer."""
+        """Return the benchmark without the skipped images, whose indices the results use."""
         queries = np.ones(len(benchmark.queries), bool)
         database = np.ones(len(benchmark.database), bool)
         queries[list(self.queries)] = database[list(self.database)] = False
@@ -71,19 +71,19 @@ class GroupingResult(NamedTuple):
     """Share of same-place images among the others that a query attends to: the mean over queries
     and seeds; None if no query attends to another."""
     database_share: float | None = None
-    """The same share for the database images."""
+    """Like `query_share`, for the images that database images attend to."""
     mirrored_share: float | None = None
-    """How closely a query's batch mirrors its correct answer's: `leakage.mirrored_share`."""
+    """How closely a query's batch mirrors that of its correct answer (`leakage.mirrored_share`)."""
     over_single: Difference | None = None
-    """Recall@1 minus that of single-image descriptors; None for that row, or without one."""
+    """Recall@1 minus that of grouping `single`; None for `single` itself, or if it was not run."""
     precision_recall: PrecisionRecall | None = None
     """The curve of the first seed; None if no query has a positive."""
     average_precision: float | None = None
-    """Mean over the seeds; None if no query has a positive."""
+    """As in `Scores`, the mean over the seeds; None if no query has a positive."""
     recall_at_full_precision: float | None = None
-    """Mean over the seeds; None if no query has a positive."""
+    """As in `Scores`, the mean over the seeds; None if no query has a positive."""
     spread: Scores | None = None
-    """Sample standard deviation over the seeds; None with fewer than two."""
+    """Sample standard deviations over the seeds; None with fewer than two seeds."""
     by_seed: Mapping[int, Scores] = MappingProxyType({})
     """Scores of each shuffle, by the seed that reproduces it; empty if nothing is random."""
     firsts: Bool[np.ndarray, "seed q"] | None = None
@@ -115,8 +115,8 @@ def summarise(
     """Summarise the rankings of one grouping as its result.
 
     Args:
-        grouping: its name.
-        rankings: neighbours by seed; one ranking if nothing is random.
+        grouping: name of the grouping.
+        rankings: the neighbours of all queries, by seed; only one if nothing is random.
         positives: correct database indices of each query.
         ks: the values of K.
         is_random: whether the rankings differ between seeds.
@@ -124,7 +124,7 @@ def summarise(
         **known: other fields of `GroupingResult`, such as its shares.
 
     Raises:
-        InputError: what `recalls` and `operating_point` raise.
+        InputError: no queries, a K below 1, a NaN similarity, or a precision out of range.
     """
     first = next(iter(rankings.values()))
     rights = [right_retrievals(each.indices, positives) for each in rankings.values()]
@@ -155,7 +155,7 @@ def summarise(
 
 
 def over_single(results: Sequence[GroupingResult]) -> list[GroupingResult]:
-    """Compare results with those of single-image descriptors under the same second stage."""
+    """Return results with `over_single` set: each against `single` with the same second stage."""
     alone = {each.rerank: each.firsts for each in results if each.grouping == "single"}
 
     def difference(result: GroupingResult) -> Difference | None:
@@ -185,7 +185,7 @@ def percent(fraction: float) -> str:
 
 
 def to_json(result: GroupingResult) -> dict[str, Any]:
-    """Convert a result to JSON values, without neighbours; recalls and shares are fractions."""
+    """Convert a result, without its neighbours, to JSON; recalls and shares are fractions."""
     sides, size, gain = (ANY, ANY), None, result.over_single
     if result.grouping != ANY:
         grouping = Grouping.parse(result.grouping)

@@ -1,4 +1,4 @@
-"""The similarities between all queries and the database, reduced to the size of a picture."""
+"""The similarities of all queries to all database images, reduced to the size of a picture."""
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -14,11 +14,11 @@ def similarity_map(
 ) -> Float32[np.ndarray, "rows columns"]:
     """Compute a picture of all similarities between queries (rows) and database (columns).
 
-    If a side has more than `most` images, several share a cell (`cells_of`), which holds the
-    largest similarity. Memory depends on the blocks that are compared at a time, not on the sets.
+    If there are more than `most` queries or database images, several share a row or column
+    (`cells_of`); a cell holds their largest similarity. Memory does not grow with their number.
 
     Raises:
-        InputError: what `retrieval.search` raises.
+        InputError: an array is empty or not of unit descriptors, or their lengths differ.
     """
     database, queries = as_sides(database, queries)
     rows, columns = cells_of(len(queries), most), cells_of(len(database), most)
@@ -36,7 +36,7 @@ def similarity_map(
 
 
 def cells_of(count: int, most: int) -> Int64[np.ndarray, " count"]:
-    """Assign each of `count` images in a row to one of at most `most` cells, evenly."""
+    """Return the cell of each of `count` images, spread evenly over at most `most` cells."""
     return np.arange(count) * min(count, most) // count
 
 
@@ -48,10 +48,10 @@ def _cells(
 
 
 class FirstSimilarities:
-    """Observer for `evaluate` that stores the picture of the first grouping's similarities."""
+    """An observer for `evaluate` that stores a picture of the first grouping's similarities."""
 
     map: Float32[np.ndarray, "rows columns"] | None = None
-    """The picture from `similarity_map`; None before the first grouping is described."""
+    """The result of `similarity_map`; None before the first grouping is described."""
 
     def __call__(
         self,

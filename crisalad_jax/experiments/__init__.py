@@ -1,1 +1,1 @@
-"""End-to-end experiments: the demo, comparisons of methods, reports."""
+"""End-to-end experiments: training, adaptation, distillation, comparisons, reports, the demo."""

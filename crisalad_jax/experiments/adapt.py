@@ -1,4 +1,4 @@
-"""Adapt a model to the environment of a map: a few steps on the map's own images."""
+"""Adapt a model to the environment of a map: train it for a few steps on the map's images."""
 
 import dataclasses
 import os
@@ -46,18 +46,18 @@ Path = str | os.PathLike[str]
 
 @brief
 class Adapted(NamedTuple):
-    """The gain of an adaptation, and its loss on other places."""
+    """The gain of an adaptation on the map's places, and its change of recall on other places."""
 
     steps: int
     held_out: tuple[float, float]
-    """`TrainConfig.monitor` before and after, for augmented copies of held-out frames; other
-    copies decide when training stops."""
+    """Recall (`TrainConfig.monitor`) before and after, with augmented copies of the held-out images
+    as queries; other copies decide when training stops."""
     others: dict[str, tuple[float, Difference]]
-    """Recall@1 of each watched set before, and its change."""
+    """Recall@1 before the adaptation, and its change, by name of the watched evaluation set."""
     weights: pathlib.Path | None
-    """The adapted weights; None if held-out frames gained nothing."""
+    """File of the adapted weights; None if the held-out images gained nothing."""
     replaced: bool
-    """Whether the map was rebuilt with them."""
+    """Whether the map was rebuilt with the adapted weights."""
 
 
 @takes(config=TrainConfig, folder=PATH, out=PATH)
@@ -81,40 +81,40 @@ def adapt(
 ) -> Adapted:
     """Adapt a map's model to the map's environment, or resume the run in `out`.
 
-    A place is the images within `place_radius`; in a map without positions, it is `place_frames`
-    consecutive images, or by default a single one under two augmentations. A fifth of the images is
-    held out. Augmented copies of them query the rest of the map: two of each decide how long to
-    train, and two others whether anything was gained.
+    A place has the images within `place_radius` of its centre; in a map without positions, it has
+    `place_frames` consecutive images, or by default only one under two augmentations. A fifth of
+    the map's images, at most 100, is held out. Augmented copies of these query the rest of the map:
+    two copies of each decide how long to train, and two others whether recall was gained.
 
     Args:
         config: the training configuration: `recipe(name="adapt", model=...)` for the map's model.
         folder: the map, whose images must be where they were indexed.
-        out: folder for the run, the held-out pictures and `adapted.safetensors`.
-        weights: the map's weights, if they were moved; None for the path that the map records.
-        images: more images of the environment, as `extract` takes them; they don't join the
-            map.
-        place_radius: metres from a place's centre within which its images lie, for a map with
-            positions; None for 10.
-        place_frames: number of consecutive images of a place, for a map without positions.
+        out: folder for the run, the held-out images and `adapted.safetensors`.
+        weights: file of the map's model, if it was moved; None for the path that the map records.
+        images: more images of the environment to train on, as `extract` takes them; they are not
+            added to the map.
+        place_radius: radius of a place in metres, for a map with positions; None for 10.
+        place_frames: number of consecutive images of a place, for a map without positions; None
+            for a place of each image.
         watch: evaluation sets of other places, whose recall is compared before and after.
         most_lost: largest accepted drop in Recall@1 of a watched set, as a fraction; the map is
             not replaced if any drops more.
         replace: whether to rebuild the map with the adapted model; see `remake_map`.
-        fps: frames per second taken from videos and logs among `images`.
-        topic: the topic of images in a log among `images`.
+        fps: frames per second taken from videos and robot logs among `images`; None for 1.
+        topic: the topic of images in a robot log among `images`; None for its only one.
         reading: how images are read.
         callbacks: see `fit`.
-        say: called with each line to print.
+        say: called with each line of progress, for instance `print`.
 
     Returns:
-        The gain, which is also written to `adapted.json` in `out`.
+        The gains, which are also written to `adapted.json` in `out`.
 
     Raises:
-        InputError: a model other than the map's; missing images; `place_frames` for a map with
-            positions, or `place_radius` for one without positions; too few images; `out` within the
-            map; `replace` for a map that cannot be rebuilt; a map that was rebuilt with `out`'s
-            weights; what `open_sources`, `open_benchmark` and `fit` raise.
-        Interrupted: the same call resumes.
+        InputError: a model other than the map's; missing images, or too few; `place_frames` for a
+            map with positions, or `place_radius` for one without; `out` within the map; `replace`
+            for a map that cannot be rebuilt; a map that was already rebuilt with the weights in
+            `out`; unreadable `images` or `watch`; or what `fit` raises.
+        Interrupted: a signal stopped the run; the same call resumes it.
 
     Example:
         >>> import dataclasses, jax
@@ -272,7 +272,7 @@ def _recall(model: Model, benchmark: Benchmark, config: TrainConfig, reading: Re
 
 
 def to_json(found: Adapted) -> dict[str, Any]:
-    """Convert the gain to JSON values by name."""
+    """Convert the result of `adapt` to JSON values by name."""
     before, after = found.held_out
     others = {
         name: {"before": recall, "change": change.mean, "interval": list(change.interval)}

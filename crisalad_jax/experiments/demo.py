@@ -37,12 +37,12 @@ from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
 GROUPINGS = ("single", "shuffled", "sequential")
-"""The groupings; not window, because rendered places have no order in time."""
+"""Groupings that the demo evaluates; not `window`: rendered places have no order in time."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DemoConfig:
-    """A run of about two minutes on two cores."""
+    """Settings of the demo; by default it takes about two minutes on two cores."""
 
     seed: int = 0
     train_places: int = 240
@@ -51,7 +51,7 @@ class DemoConfig:
 
 
 class DemoSummary(NamedTuple):
-    """Results and files of the demo."""
+    """Results and files of the demo, and its seconds in all and in training."""
 
     rows: list[RecallRow]
     pictures: list[pathlib.Path]
@@ -60,9 +60,9 @@ class DemoSummary(NamedTuple):
 
 
 def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> DemoSummary:
-    """Render, evaluate untrained, train, evaluate again; write tables and pictures into `out`.
+    """Render a city, evaluate before and after training; write tables and pictures into `out`.
 
-    The training run under `out/run` resumes if it was interrupted.
+    If the training run in `out/run` was interrupted, it resumes.
 
     Raises:
         InputError: `out` holds other files, or a demo of another configuration; or another process
@@ -126,7 +126,7 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
 
 
 def demo_recipe(config: DemoConfig) -> TrainConfig:
-    """Return the `tiny` recipe for four images per place, whose light already varies enough."""
+    """Return the `tiny` recipe for four images per place, mildly augmented: their light varies."""
     return dataclasses.replace(
         recipe("tiny"),
         augmentation=LightAugmentConfig(),

@@ -56,31 +56,32 @@ def distil(
     same images reuse them. The student trains on augmented images.
 
     Args:
-        config: how the student trains, usually `recipe(preset, "distil")`. The teacher's descriptor
-            length is filled in.
+        config: how the student trains, usually `recipe(preset, "distil")`. The length of the
+            teacher's descriptors is filled in.
         teacher: the model to learn from.
         images: one source of images or several, as `extract` takes them; None with `data`.
-        data: labelled places instead, in a layout that `read_places` reads; the loss's term
-            `labels` uses them.
+        data: places with labels, in place of `images`, in a layout that `read_places` reads; only
+            the term `labels` of the loss uses the labels.
         out: folder of the run; see `fit`.
-        weights: the student's weights to start from, or a published model's name.
-        validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
+        weights: weights that the student starts from, or the name of a published model.
+        validation: evaluation set that selects the best weights and, with `config.patience`, stops
+            early; in any layout that `open_benchmark` reads.
         validation_images: folder of the images, if a .mat file or .npy in `validation` lists them.
-        fps: frames per second taken from videos and logs.
-        topic: the topic of images in a log.
+        fps: frames per second taken from videos and robot logs; None for 1.
+        topic: the topic of images in a robot log; None for its only one.
         reading: how images are read.
         cache_gb: maximum gigabytes of remote images cached on this host's disk.
         callbacks: see `fit`.
-        say: called with each line to print.
+        say: called with each line of progress, for instance `print`.
 
     Returns:
-        How the run ended.
+        The student's final parameters, and how the run ended.
 
     Raises:
-        InputError: both or neither of `images` and `data`; a loss without a teacher; `labels`
-            without `data` or with one image a place; a student with a cross-image encoder; too few
-            images; what `open_sources`, `read_places`, `extract`, `open_benchmark` and `fit` raise.
-        Interrupted: the same call resumes.
+        InputError: both or neither of `images` and `data`; a loss other than `distil`; its `labels`
+            without `data`, or with one image per place; a student with a cross-image encoder; too
+            few images, or unreadable ones; or what `open_benchmark` and `fit` raise.
+        Interrupted: a signal stopped the run; the same call resumes it.
 
     Example:
         >>> import dataclasses
@@ -162,11 +163,11 @@ def teachers_descriptors(
         reading: how images are read.
 
     Returns:
-        One descriptor for each image, in order, as a memory map or array; zeros for an unreadable
-        image.
+        A unit descriptor of each image, in order, as a memory map or array; a row of zeros for an
+        unreadable image.
 
     Raises:
-        InputError: what `extract` raises.
+        InputError: an image cannot be read, or the cache cannot be written (see `extract`).
     """
     paths = [places.path(image) for image in range(len(places.files))]
     states = for_each(lambda path: state_of(file_of(path)), paths)

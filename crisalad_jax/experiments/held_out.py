@@ -23,25 +23,25 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 
 SHARE, MOST = 0.2, 100
-"""Share of a map's images that is held out, and their maximum number."""
+"""Share of a map's images that is held out, and the maximum number of held-out images."""
 CHOOSING, JUDGING = range(2), range(2, 4)
-"""Augmented copies of a held-out image that stop the training, and those that measure the gain:
-the best of several validations is biased upwards."""
+"""Numbers of the augmented copies of a held-out image that stop the training, and of those that
+measure the gain; they differ because the best of several validations is biased upwards."""
 
 
 class Split(NamedTuple):
-    """The images of a map, and more of its environment, after the split."""
+    """The images of a map and its environment after the split; numbers are indices in `source`."""
 
     source: ImageSource
     """All images, those of the map first."""
     training: Places
     """Places made of the images that are not held out."""
     answers: dict[int, list[int]]
-    """Correct answers to each held-out image among the others; itself if there are none."""
+    """Correct answers to each held-out image among the map's others; itself if there are none."""
     database: list[int]
-    """Images of the map that held-out ones query."""
+    """Images of the map that the held-out images query."""
     rule: str
-    """Description of a correct answer."""
+    """Description of what makes an answer correct."""
 
 
 def split_images(
@@ -54,8 +54,8 @@ def split_images(
     """Hold out some of a map's images, and group the rest into places.
 
     Args:
-        sources: the map's images, and more of its environment.
-        seed: seed that draws the held-out images.
+        sources: the images of the map, then any others of its environment.
+        seed: random seed for drawing the held-out images.
         place_radius: metres within which images show the same place.
         place_frames: number of consecutive images of a place; without either, each image is one.
 
@@ -114,9 +114,9 @@ def _consecutive(source: ImageSource, frames: int) -> list[list[int]]:
 
 
 def with_repeats(places: Places, images: int) -> Places:
-    """Repeat the images of a small place, in turn, until it has that many.
+    """Repeat the images of each smaller place, in turn, until it has `images` images.
 
-    A batch then has several augmentations of one image.
+    A batch then has several augmentations of the same image.
     """
     counts = np.maximum(places.image_counts, images)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -127,7 +127,7 @@ def with_repeats(places: Places, images: int) -> Places:
 
 
 def count_apart(places: Places) -> int:
-    """Count places that can share a batch: each in turn that is not near an earlier one."""
+    """Count places that can share a batch: in order, those not near an already counted one."""
     taken = set[int]()
     for place in range(len(places.names)):
         if places.near is None or taken.isdisjoint(places.near[place].tolist()):
@@ -142,14 +142,14 @@ def held_out_benchmark(
     copies: Sequence[int],
     on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
-    """Write augmented copies of the held-out images, and make the set in which they query the map.
+    """Write augmented copies of the held-out images; return a benchmark in which they are queries.
 
     Args:
-        config: the run's configuration; the copies are augmented as training images are.
-        split: the images.
-        folder: where the copies are written.
-        copies: numbers of the copies of each image, which seed the augmentation.
-        on_bad_image: whether an unreadable image is left out.
+        config: configuration of the run; the copies are augmented as training images are.
+        split: the images. Its `database` is the database of the benchmark.
+        folder: where the copies are written, as PNG files.
+        copies: numbers of the copies to make of each image, which seed the augmentation.
+        on_bad_image: "stop" at an unreadable image, or "skip" it.
 
     Raises:
         InputError: an image cannot be read, or none can, or the folder cannot be written to.

@@ -1,4 +1,4 @@
-"""Write a run in the form that the hub expects: weights, configuration, and a model card."""
+"""Write a run as the Hugging Face Hub expects it: weights, configuration and a model card."""
 
 import contextlib
 import json
@@ -51,13 +51,13 @@ def publish(
 
     The result has `model.safetensors`, `config.json` and `README.md`, a model card written from the
     run: what the model is, its training data and recipe, recalls with their intervals, the licence,
-    and how to use it. `load` reads the folder, and hf://OWNER/NAME.
+    and how to use it. `load` reads such a folder, and hf://OWNER/NAME.
 
     Args:
         run: the run's folder, with best.safetensors or last.safetensors.
-        to: a new or empty folder, or hf://OWNER/NAME of a repository without these files.
-        licence: the licence of the weights, by the hub's name for it, such as apache-2.0 or
-            cc-by-nc-4.0; the initial weights and the training data may restrict it.
+        to: a new or empty folder, or hf://OWNER/NAME of a repository, new or without these files.
+        licence: licence of the weights, by the hub's name for it, such as apache-2.0 or
+            cc-by-nc-4.0; the initial weights and the training data may restrict the choice.
         data: description of the training data; None for what the run recorded.
         evaluations: files that `crisalad evaluate --json` wrote for this model.
         quiet: whether to hide the progress bar.
@@ -66,8 +66,8 @@ def publish(
         The folder, or the address of the repository's page.
 
     Raises:
-        InputError: the run has no weights; a file is missing or damaged; the folder is not
-            empty; an invalid licence name; or what `upload_folder` raises.
+        InputError: the run has no weights; a file is missing or damaged; the folder is not empty,
+            or the repository has such files; an invalid licence name; or the upload fails.
         ModuleNotFoundError: huggingface_hub is not installed, and `to` is on the hub.
 
     Example:

@@ -46,12 +46,12 @@ _Colour = tuple[int, int, int]
 def record(
     path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = None
 ) -> Iterator["Recording"]:
-    """Write a recording, which appears at `path` once it is complete, even after a signal.
+    """Open a recording for writing; it appears at `path` after the block, even if a signal ends it.
 
     Args:
         path: the file, `.rrd`.
-        root: folder of the map's images; None is the original one. Missing images are left out,
-            with a warning.
+        root: folder of the map's images; None is the folder that was indexed. Missing images are
+            left out, with a warning.
 
     Raises:
         InputError: the file cannot be created.
@@ -77,7 +77,7 @@ def record(
 def record_results(
     path: str | os.PathLike[str], benchmark: "Benchmark", results: Sequence["GroupingResult"]
 ) -> None:
-    """Write the results of an evaluation as a recording.
+    """Write the results of an evaluation as a recording for Rerun.
 
     Args:
         path: the file, `.rrd`.
@@ -118,13 +118,13 @@ class Recording:
         right: Sequence[bool] | None = None,
         label: str = "",
     ) -> None:
-        """Add queries with their answers, each as the next frame.
+        """Add queries with their answers, each query as the next frame.
 
         Args:
-            answers: what `query` found; each label belongs to one map.
+            answers: what `query` found; calls with the same label must query the same map.
             images: pixels of the queries; None reads their files.
             right: whether each first answer is correct; None treats known places as correct.
-            label: first part of the names of these entities, such as a grouping; "" for none.
+            label: start of the path of these entities in Rerun, such as a grouping; "" for none.
 
         Raises:
             InputError: a query's file cannot be read.
@@ -175,7 +175,7 @@ class Recording:
         return None
 
     def finish(self) -> None:
-        """Log the trajectories and the layout of the viewer."""
+        """Log the trajectories and the layout of the viewer; `record` calls this at the end."""
         if self._lost:
             first = next(iter(self._lost.values()))
             warn(

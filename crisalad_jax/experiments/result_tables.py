@@ -8,7 +8,7 @@ from crisalad_jax.experiments.tables import NOTHING, Cell, Table
 
 
 def result_tables(results: Sequence[GroupingResult]) -> list[Table]:
-    """Make the tables of an evaluation: recalls, and if any, leakage and operating points."""
+    """Make the tables of an evaluation: recalls, and leakage and operating points if measured."""
     tables = [grouping_table(results)]
     if any(each.grouping != ANY for each in results):
         tables.append(leakage_table(results))
@@ -18,9 +18,9 @@ def result_tables(results: Sequence[GroupingResult]) -> list[Table]:
 
 
 def grouping_table(results: Sequence[GroupingResult]) -> Table:
-    """Make a table of results in percent, about 85 columns wide in the terminal.
+    """Make a table of recalls and precisions in percent, about 85 characters wide in the terminal.
 
-    Each recall is above its interval; a mean over shuffles is followed by their spread.
+    Each recall is above its 95 % interval; a standard deviation follows a mean over shuffles.
     """
     recall_names = [f"R@{k}\n95 %" for k in results[0].recalls]
     names = (*recall_names, "AP", "R at\n100 % P")
@@ -47,7 +47,7 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
 
 
 def leakage_table(results: Sequence[GroupingResult]) -> Table:
-    """Make a table of what groupings gain over single-image descriptors, and what they leak."""
+    """Make a table of what each grouping gains over single-image descriptors, and what it leaks."""
     rows = []
     for result in results:
         gain = result.over_single
@@ -72,7 +72,7 @@ def _points(difference: float) -> str:
 
 
 def points_table(points: Mapping[str, OperatingPoint], asked: str = "similarity") -> Table:
-    """Make a table of operating points by name: the threshold, and its precision and recall."""
+    """Make a table of operating points by name; `asked` is what their thresholds apply to."""
     names = (
         f"{asked}\nthreshold",
         "precision,\n95 % bound",

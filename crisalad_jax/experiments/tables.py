@@ -32,14 +32,14 @@ class Cell(NamedTuple):
 
     text: str
     note: str = ""
-    """Secondary text, such as an interval: its lines are below the text in a page and in a
-    `stacked` table, elsewhere after it."""
+    """Secondary text, such as an interval. In a page and in a `stacked` table its lines are below
+    the text, elsewhere after it."""
     kind: str = ""
-    """How a page shows it: best, right or wrong."""
+    """How a page highlights the cell: "best", "right" or "wrong"; "" for not at all."""
 
 
 class Table(NamedTuple):
-    """A table for any medium."""
+    """A table for the terminal, Markdown, LaTeX and pages."""
 
     headers: Sequence[str]
     rows: Sequence[Sequence[Cell]]
@@ -52,7 +52,7 @@ class Table(NamedTuple):
     """Whether the last row is the sum of the others."""
 
     def terminal(self) -> rich.table.Table:
-        """Make the table for the terminal, with lines where `_ends` says."""
+        """Make the table for the terminal, with lines between groups of rows and above a sum."""
         table = rich.table.Table(
             title=self.title or None, title_justify="left", show_lines=self.stacked
         )
@@ -77,7 +77,7 @@ class Table(NamedTuple):
         return [*ends[: len(ends) - self.summed], *[True] * self.summed, False]
 
     def markdown(self) -> str:
-        """Write the table as Markdown, one line a row, ending in a newline."""
+        """Return the table as Markdown, with one line per row, ending in a newline."""
         rule = ["---"] * self.labels + ["---:"] * (len(self.headers) - self.labels)
         headers = [header.replace("\n", " ") for header in self.headers]
         rows = [headers, *(map(_in_line, cells) for cells in self.rows)]
@@ -85,9 +85,9 @@ class Table(NamedTuple):
         return "".join(f"| {' | '.join(cells)} |\n" for cells in [head, rule, *body])
 
     def latex(self) -> str:
-        """Write the table as a tabular for LaTeX's package booktabs, ending in a newline.
+        """Return the table as a LaTeX tabular for the package booktabs, ending in a newline.
 
-        The best of a column is bold, and notes follow their texts in a smaller size.
+        Cells of kind "best" are bold, and notes follow their texts in a smaller size.
         """
         numbers = len(self.headers) - self.labels
         head = []
@@ -128,15 +128,15 @@ class RecallRow(NamedTuple):
 
     benchmark: str
     model: str
-    """Which weights, for instance "trained, seed 0"."""
+    """Description of the model, for instance "trained, seed 0"."""
     grouping: str
-    """How images were batched: single, shuffled or sequential."""
+    """How images were grouped into batches, for instance "single" or "shuffled"."""
     recalls: Mapping[int, float]
     """Fraction of the queries, 0 to 1, by K."""
 
 
 def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:
-    """Make a table of recalls in percent with one decimal, a line for each row."""
+    """Make a table of recalls in percent, with one decimal; K that a row lacks are "-"."""
     ks = sorted({k for row in rows for k in row.recalls})
     body = [
         [row.benchmark, row.model, row.grouping]
@@ -148,7 +148,7 @@ def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:
 
 
 def write_csv(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV file of rows with the same columns; None is an empty cell."""
+    """Write rows with the same columns as CSV; None is an empty cell, and formulas are quoted."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -164,6 +164,6 @@ def _no_formula(value: Any) -> Any:
 
 
 def write_text(path: pathlib.Path, text: str) -> None:
-    """Write a UTF-8 file atomically; other bytes, as in file names, become escapes."""
+    """Write a UTF-8 file atomically; bytes of file names that are not UTF-8 become escapes."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")

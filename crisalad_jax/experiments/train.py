@@ -1,4 +1,4 @@
-"""A training run from folders to curves."""
+"""A training run: read the data, train, and draw the curves."""
 
 import os
 import pathlib
@@ -57,34 +57,35 @@ def train(
         data: places, in a layout that `read_places` reads, local or remote; or the sets of
             `config.mixture` by name, in such layouts; or, for a recipe that mines tuples, a set
             that `open_benchmark` reads, such as pitts30k_train.mat.
-        place_radius: radius of a place in metres; see `read_places`, also for the next four
+        place_radius: radius of a place in metres; see `read_places` for this and the next four
             arguments.
         place_frames: number of consecutive images of a place.
-        positions: table of positions.
-        fps: frames per second taken from videos and logs.
-        topic: the topic of images in a log.
+        positions: table or track of positions.
+        fps: frames per second taken from videos and robot logs.
+        topic: the topic of images in a robot log.
         images: folder of the images that a file such as pitts30k_train.mat names.
         out: folder of the run; see `fit`.
-        validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
-        validation_images: folder of the images that a .mat file or .npy lists in `validation` name.
+        validation: evaluation set that selects the best weights and, with `config.patience`, stops
+            early; in any layout that `open_benchmark` reads.
+        validation_images: folder of the images, if a .mat file or .npy in `validation` lists them.
         weights: a complete model to start from, or a published model's name. It must fit
             `config.model`; `recipe(model=load(weights).config)` makes a `config` that does.
         backbone: a checkpoint to start the backbone from, or a published model's name.
-        on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
+        on_bad_image: "stop" at an unreadable image, or "skip" it: mask it out, and count it.
         num_threads: number of threads that read the training images; None for one per usable core.
-        shard_state: whether to shard trainable parameters and their moments over the devices.
+        shard_state: whether to shard trainable parameters and optimiser moments over the devices.
         cache_gb: maximum gigabytes of remote images cached on this host's disk.
         callbacks: see `fit`.
         quiet: whether to hide progress bars.
-        say: called with each line to print.
+        say: called with each line of progress, for instance `print`.
 
     Returns:
-        How the run ended.
+        The final parameters, and how the run ended.
 
     Raises:
-        InputError: what `read_start`, `read_places`, `read_query_set`, `open_benchmark` and `fit`
-            raise; `out` holds something other than a run with this configuration.
-        Interrupted: what `fit` raises; the same call resumes.
+        InputError: the data or weights cannot be read or do not fit; `out` holds something other
+            than a run with this configuration; or what `open_benchmark` and `fit` raise.
+        Interrupted: a signal stopped the run; the same call resumes it.
 
     Example:
         >>> import dataclasses
@@ -132,7 +133,7 @@ def train(
 
 
 def finish_run(out: Path, name: str, places: TrainingSet, benchmark: Benchmark | None) -> None:
-    """Draw the curves of a run, and record what it trained on; see `write_data`."""
+    """Draw a run's curves.png, and record what it trained on for a model card (`write_data`)."""
     out = pathlib.Path(out)
     save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     write_data(out, name, places, benchmark)

@@ -35,7 +35,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 from crisalad_jax.utils.target import target
 
 Heads = Float[Array, "*batch token head dim"]
-"""Queries, keys or values."""
+"""Queries, keys or values, split into heads."""
 
 
 @pytree_dataclass
@@ -47,7 +47,7 @@ class Attention:
 
 
 class Rotation(NamedTuple):
-    """Rotation angles of a sequence's last tokens, one for each pair of a head's dimensions."""
+    """Rotary (RoPE) angles of a sequence's last tokens, one per pair of a head's dimensions."""
 
     cosines: Float[np.ndarray, "patch pair"]
     sines: Float[np.ndarray, "patch pair"]
@@ -75,15 +75,15 @@ def attention(
 
     Args:
         params: the projections.
-        x: tokens.
-        heads: number of heads.
-        length: number of leading tokens that are not padding; only these are attended to. None is
-            all. See `attention_fused.padded_length`.
-        rotation: rotates queries and keys by the angles of their tokens.
-        update: what an adapter adds to the outputs of the projections.
+        x: tokens of a sequence or a batch.
+        heads: number of heads, a divisor of `dim`.
+        length: number of leading tokens that are not padding; only these are attended to. None
+            means all. See `attention_fused.padded_length`.
+        rotation: angles by which queries and keys are rotated; None rotates none.
+        update: returns what an adapter adds to the output of a projection; by default nothing.
 
     Returns:
-        The updates of the tokens. Scores and softmax are float32 at least, for every type of `x`.
+        The attention's output. Scores and softmax are in float32 at least, for every type of `x`.
     """
     tokens = x.shape[-2]
     length = tokens if length is None else length
@@ -102,15 +102,15 @@ def attention(
 
 
 def split_heads(x: Float[Array, "*batch dim"], heads: int) -> Float[Array, "*batch head _"]:
-    """Split the dimensions of each token into heads, side by side."""
+    """Split the last axis into `heads` consecutive parts, along a new axis before it."""
     return x.reshape(*x.shape[:-1], heads, x.shape[-1] // heads)
 
 
 def rotate(x: Heads, rotation: Rotation, *, length: int | None = None) -> Heads:
     """Rotate queries or keys by the angles of their tokens (RoPE: Su et al. 2021), in float32.
 
-    Dimensions i and i + dim / 2 of a head are a pair. Tokens before those with angles are returned
-    bit for bit, as is padding after the first `length` tokens.
+    Dimensions i and i + dim / 2 of a head are a pair. Of the `length` leading tokens that are not
+    padding (None: all), the last have angles. All other tokens are returned bit for bit.
     """
     wide = at_least_float32(x)
     length = x.shape[-3] if length is None else length
@@ -152,7 +152,7 @@ def first_token_attention(
 ) -> Float[Array, "*batch head token"]:
     """Compute the first token's weights in `attention`, over all tokens, in float32 at least.
 
-    The weights of a head sum to 1. `rotation` rotates keys; the first token has no angle.
+    The weights of a head sum to 1. `rotation` rotates only keys: the first token has no angle.
     """
     dim = x.shape[-1]
     query = part_of_qkv(params, 0, x[..., :1, :], update)[..., 0, :] / math.sqrt(dim // heads)
@@ -175,7 +175,7 @@ def attention_weights(
 ) -> Float[Array, "*batch head token token"]:
     """Compute the weights of `attention`, of every token for every token, in float32 at least.
 
-    Rows sum to 1. `mask[i, j]` allows token i to attend to token j.
+    Each row sums to 1. `mask[i, j]` allows token i to attend to token j; None allows all.
     """
     queries, keys = (split_heads(part_of_qkv(params, i, x, update), heads) for i in (0, 1))
     if rotation is not None:
@@ -191,7 +191,7 @@ def part_of_qkv(
     x: Float[Array, "*batch token dim"],
     update: LinearUpdate = no_update,
 ) -> Float[Array, "*batch token dim"]:
-    """Compute only queries (0), keys (1) or values (2), with heads side by side."""
+    """Compute only the queries (`number` 0), keys (1) or values (2), heads concatenated."""
     here = slice(number * x.shape[-1], (number + 1) * x.shape[-1])
     y, extra = linear(columns(params.qkv, here.start, here.stop), x), update("qkv", x)
     return y if extra is None else y + extra[..., here]
@@ -231,11 +231,11 @@ def dot_product_attention(
     that they take twice as long on a CPU. Forward mode (`jax.jvp`) is not supported.
 
     Args:
-        queries: not yet divided by the square root of their width.
+        queries: queries, which this function divides by the square root of their width.
         keys: keys of the tokens that queries attend to.
         values: values of the same tokens.
         mask: `mask[i, j]` allows query i to attend to key j; a row must allow at least one.
-        dropout_mask: factors that multiply the weights, 0 or above 1.
+        dropout_mask: factors of the weights, each 0 (dropped) or above 1; None drops nothing.
     """
     queries = queries / math.sqrt(queries.shape[-1])
     dropped = None if dropout_mask is None else dropout_mask.swapaxes(-2, -1)

@@ -21,7 +21,7 @@ _CUDNN_HEAD = 128
 
 
 def padded_length(tokens: int, dtype: Any, dim: int, heads: int) -> int:
-    """Return the length to pad a sequence to, so that no call of `attention` has to pad it.
+    """Return the length to pad a sequence to for fused attention; `tokens` if it is not fused.
 
     Example:
         >>> from crisalad_jax.utils.target import CPU, lowering_for
@@ -40,11 +40,11 @@ def attend(
     """Average the values for each query, weighted by the softmax of its scores.
 
     Args:
-        qkv: the heads of the queries, then of the keys, then of the values.
+        qkv: the heads of the queries, then those of the keys, then those of the values.
         length: number of leading tokens that are not padding; only these are attended to.
 
     Returns:
-        The averages; None if no kernel supports such tokens.
+        The averages; None if no kernel supports this type, width and number of tokens here.
     """
     *batch, tokens, three_heads, width = qkv.shape
     heads = three_heads // 3

@@ -57,8 +57,8 @@ def attend(
         qkv: queries, keys and values side by side, each with the heads side by side.
         heads: number of heads; see `fits`.
         length: number of leading tokens that are not padding; only these are attended to.
-        precision: precision of float32 products. None is "default", one pass. The kernel compiler
-            does not support "high", so "highest" replaces it.
+        precision: precision of float32 products. None means "default", one bfloat16 pass. The
+            kernel compiler does not support "high", so "highest" replaces it.
         mesh: devices that the batch is sharded over, from `traced_mesh`.
 
     Returns:

@@ -17,7 +17,7 @@ from crisalad_jax.nn.cross_image import CROSS_IMAGE, CrossImage, CrossImageConfi
 from crisalad_jax.nn.projection import ProjectionConfig
 
 MOST_PIXELS = 4096
-"""Largest side of an image that models accept: attention grows with its fourth power."""
+"""Largest image side in pixels that models accept: the cost of attention grows as its 4th power."""
 
 
 @short_repr("backbone", "aggregator")
@@ -25,8 +25,8 @@ MOST_PIXELS = 4096
 class ModelConfig:
     """The configuration of CriSALAD and of the methods that it is compared with.
 
-    DINO-SALAD has no adapter and no encoder. CricaVPR has the multi-resolution adapter and the GeM
-    pyramid. Bare DINOv2 uses its class token. See docs/methods.md for all methods.
+    DINO-SALAD has no adapter and no cross-image encoder. CricaVPR has the multi-resolution adapter
+    and the GeM pyramid. Bare DINOv2 uses its class token. See docs/methods.md for all methods.
 
     Example:
         >>> model = ModelConfig(aggregator="gem", cross_image="none")
@@ -35,7 +35,7 @@ class ModelConfig:
     """
 
     image_size: tuple[int, int] = non_semantic_field((224, 224))
-    """Height and width that images are resized to, multiples of the patch size (but see
+    """Height and width in pixels that images are resized to, multiples of the patch size (but see
     `PreprocessingConfig.size_rule`)."""
     preprocessing: PreprocessingConfig = PreprocessingConfig()
     """How images are resized and normalised."""
@@ -44,7 +44,7 @@ class ModelConfig:
     aggregator: OrName[Aggregator] = part_field(AGGREGATORS, "salad")
     """Registered aggregator, or its name; it turns features into tokens."""
     cross_image: OrName[CrossImage] = part_field(CROSS_IMAGE, "transformer")
-    """Registered encoder, or its name; it relates the images of a batch."""
+    """Registered cross-image encoder, or its name; it relates the images of a batch."""
     projection: ProjectionConfig = ProjectionConfig()
     """Linear layer over the descriptor; by default none."""
     compute_dtype: Literal["float32", "bfloat16", "float64"] = non_semantic_field("float32")
@@ -146,10 +146,10 @@ class ModelConfig:
 
     @property
     def input_size(self) -> Size:
-        """Height and width of the network's input: `image_size`, rounded if `preprocessing` does.
+        """Height and width of the network's input: `image_size`, rounded if `preprocessing` rounds.
 
-        Training, exports and costs use this size, whatever `PreprocessingConfig.size_rule` is. For
-        local features, it is `Backbone.encoded_size`.
+        Training, exports and cost counts use this size, whatever `PreprocessingConfig.size_rule`
+        is. For local features, it is `Backbone.encoded_size`.
         """
         return self.backbone.encoded_size or self.rounded_size(self.image_size)
 
@@ -159,7 +159,7 @@ class ModelConfig:
 
     @property
     def side_multiple(self) -> int:
-        """Number of pixels that sides are multiples of: 1 if the backbone takes any size."""
+        """Number of pixels that image sides are multiples of: 1 if the backbone takes any size."""
         return 1 if self.backbone.any_size else self.backbone.patch_size
 
     @property
@@ -181,7 +181,7 @@ class ModelConfig:
 
         Raises:
             InputError: a side is above `MOST_PIXELS` or not a multiple of the patch size, there are
-                too few patches for the aggregator, or its parameters are for another size.
+                too few patches for the aggregator, or the aggregator is for another size.
         """
         found = " x ".join(map(str, image_size))
         require(
@@ -200,15 +200,15 @@ class ModelConfig:
         """Return this model with another image size, or another way to resize images.
 
         Args:
-            image_size: height and width in pixels; None keeps the model's own.
-            resize: values of `preprocessing.WORDS`, such as "bicubic"; empty keeps the model's own.
+            image_size: height and width in pixels; None is the model's own.
+            resize: values of `preprocessing.WORDS`, such as "bicubic"; empty changes nothing.
 
         Returns:
             The configuration, for the same parameters.
 
         Raises:
-            InputError: what `check_image_size` and `PreprocessingConfig.changed_by` raise; or a
-                size is given for a model that takes images at their own size.
+            InputError: see `check_image_size` and `PreprocessingConfig.changed_by`; also if a size
+                is given for a model that takes images at their own size.
 
         Example:
             >>> PRESETS["tiny"].resized((70, 98)).grid
@@ -246,14 +246,14 @@ PRESETS: Mapping[str, ModelConfig] = {
     "l14": _preset(1024, 24, 16),
     "g14": _preset(1536, 40, 24, ffn="swiglu"),
 }
-"""Model sizes by name."""
+"""Configurations by model size; "b14" is the model of the paper."""
 
 
 def check_unit_length(model: ModelConfig, name: str) -> None:
     """Check that a model outputs unit vectors, which are compared by cosine.
 
     Raises:
-        InputError: it does not; the message begins with `name`.
+        InputError: the descriptors are not unit vectors; the message begins with `name`.
     """
     require(
         model.unit_length,
@@ -268,14 +268,14 @@ def with_aggregator(model: ModelConfig, name: str, preset: str, **changes: Any) 
     Args:
         model: the configuration.
         name: a registered aggregator.
-        preset: preset of the aggregator's size.
-        **changes: other fields of the model.
+        preset: model size, such as "b14", for which the aggregator's settings are made.
+        **changes: other fields of the model to change.
 
     Returns:
         The changed configuration.
 
     Raises:
-        InputError: no such aggregator, or it does not fit the model.
+        InputError: the aggregator is not registered, or does not fit the model.
 
     Example:
         >>> with_aggregator(PRESETS["tiny"], "gem", "tiny", cross_image="none").descriptor_dim

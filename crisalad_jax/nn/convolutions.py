@@ -14,7 +14,7 @@ from crisalad_jax.nn.layers import BatchNorm, Conv, Valid, conv, init_batch_norm
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 Map = Float[Array, "image _ _ _"]
-"""Features in rows and columns, channels last."""
+"""Features of a batch of images in rows and columns, channels last."""
 BATCH_NORM_EPSILON = 1e-5
 """Epsilon of torch's `nn.BatchNorm2d`, which all published backbones use."""
 
@@ -62,12 +62,12 @@ def conv_norm(
     Args:
         params: the layers.
         x: a batch of images.
-        valid: images that the batch's statistics are taken from; None uses the stored ones.
+        valid: mask of the images whose statistics are used; None uses the stored statistics.
         stride: stride of the convolution.
         epsilon: added to the variance.
 
     Returns:
-        (y, updated): `updated` has updated running statistics if `valid` is given.
+        (y, updated): `updated` is `params`, with new running statistics if `valid` is given.
     """
     if valid is not None:
         y = conv(params.conv, x, stride=stride)
@@ -86,7 +86,7 @@ def max_pool(
 ) -> Float[Array, "*batch rows columns dim"]:
     """Return the maximum of each window of size x size pixels, ignoring padding.
 
-    The gradient goes to the first of equal pixels, as in torch. Forward mode is not supported.
+    The gradient goes to the first of equal pixels, as in torch. `jax.jvp` is not supported.
     """
     images = x.reshape(-1, *x.shape[-3:])
     y = _max_pool(images, size, stride, padding)

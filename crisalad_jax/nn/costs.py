@@ -34,7 +34,7 @@ _NAMES = re.compile(r"\w+")
 
 
 class PartCost(NamedTuple):
-    """The costs of one part of the model."""
+    """The parameters and multiply-accumulates of one part of the model."""
 
     part: str
     parameters: int
@@ -54,7 +54,7 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
             cost of its attention depends on it.
 
     Returns:
-        A row for each part.
+        One `PartCost` for each part, from the input to the descriptor.
 
     Example:
         >>> from crisalad_jax import PRESETS
@@ -96,11 +96,11 @@ def count_macs(function: Any, *arguments: Any) -> "collections.Counter[str]":
 
     Args:
         function: a function of arrays.
-        arguments: arrays, or their shapes.
+        arguments: arrays, or their shapes (`jax.ShapeDtypeStruct`).
 
     Returns:
-        The counts of each part of a model, and of everything else under an empty name. Only the
-        cheapest branch of a conditional counts.
+        The counts by name of the model's part, and of everything else under an empty name. Only
+        the cheapest branch of a conditional counts.
 
     Example:
         >>> import jax.numpy as jnp
@@ -145,7 +145,7 @@ def _macs(equation: Any, name: str, scope: str) -> int:
 
 
 def adapter_macs(config: ModelConfig) -> int:
-    """Count the multiply-accumulates per image that the adapter adds to a block."""
+    """Count the multiply-accumulates per image that the adapter adds to one block."""
     backbone: Any = dataclasses.replace(config.backbone, depth=1)  # pyright: ignore
     shape = 1, 1 + backbone.registers + config.patches, backbone.dim
     tokens = jax.ShapeDtypeStruct(shape, jnp.float32)
@@ -161,7 +161,7 @@ def adapter_macs(config: ModelConfig) -> int:
 def paper_adapter_macs(config: ModelConfig, macs: int) -> int:
     """Count an adapter's multiply-accumulates as the paper does (Table 3: 39.223 M).
 
-    Its linear layers, `down` and `up`, count once each; the paper's other layers are convolutions.
+    Its linear layers, `down` and `up`, count for one token only; the other layers are convolutions.
 
     Args:
         config: the model's configuration.

@@ -67,7 +67,7 @@ class CrossImage(Part, abc.ABC):
         """Raise InputError if tokens of this width are not supported; by default never."""
 
     def numbers(self, params: Any) -> Mapping[str, Any]:
-        """Return values of the parameters that validations log, by name; by default none."""
+        """Return values of the parameters to log by name at each validation; by default none."""
         return {}
 
     @abc.abstractmethod
@@ -81,7 +81,7 @@ class CrossImage(Part, abc.ABC):
         Args:
             params: from `init`.
             tokens: tokens of every image, in the type to compute in.
-            mask: which images attend to which, every image to at least one; None is all to all.
+            mask: which images attend to which, every image to at least one; None allows all.
             key: random key for dropout; None means inference.
         """
 
@@ -96,7 +96,7 @@ class CrossImage(Part, abc.ABC):
             mask: see `apply`.
 
         Raises:
-            InputError: the encoder has no attention, which is the default.
+            InputError: the encoder has no attention; by default it has none.
         """
         raise InputError(f"cross_image: found {self.part_name}, expected one that has attention")
 
@@ -121,7 +121,7 @@ class NoCrossImage(CrossImage):
 
 @pytree_dataclass
 class CrossImageEncoder:
-    """The layers, in order."""
+    """Parameters of the encoder: its layers, in order."""
 
     layers: tuple[EncoderLayer, ...]
 
@@ -226,18 +226,18 @@ class CrossImageConfig(TransformerEncoder):
 class SageCrossImageConfig(TransformerEncoder):
     """SAGE's transformer encoder (ICLR 2026), over a finished descriptor cut into tokens.
 
-    Its descriptors are not unit vectors, and are compared by Euclidean distance. Losses take them
-    normalised.
+    Its descriptors are not unit vectors, and are compared by Euclidean distance. Only for losses
+    are they normalised.
     """
 
     feedforward: PositiveInt = 1024
     width: PositiveInt = 768
-    """Width of a token, a divisor of the descriptor's."""
+    """Width of the tokens that the descriptor is cut into, a divisor of the descriptor's width."""
 
 
 @pytree_dataclass
 class GatedEncoder:
-    """A gate, and the encoder behind it."""
+    """Parameters of a gate, and of the encoder behind it."""
 
     gate: Float[Array, ""]
     encoder: CrossImageEncoder
@@ -263,7 +263,7 @@ class GatedCrossImageConfig(CrossImageConfig):
         return (before + jnp.tanh(params.gate) * (after - before)).astype(tokens.dtype)
 
     def numbers(self, params: GatedEncoder) -> Mapping[str, Any]:
-        """Return how far the gate is open."""
+        """Return tanh(g) as "gate", to log: 0 is a closed gate."""
         return {"gate": jnp.tanh(params.gate)}
 
     def attention(

@@ -19,9 +19,9 @@ Keys = Key[Array, "*keys"] | None
 Grid = tuple[int, int]
 """Rows and columns of patches."""
 Valid = Bool[Array, " image"] | None
-"""Images whose statistics batch norms normalise by in training; None uses the stored ones."""
+"""Mask of the images whose statistics batch norms use in training; None uses the stored ones."""
 TAPS = "taps"
-"""Scope of elementwise products that are the multiply-accumulates of a convolution."""
+"""Name of the scope of the elementwise products that make up a depthwise convolution."""
 STATISTICS = ("running_mean", "running_var")
 """Fields of `BatchNorm` that are measured, not learnt."""
 MOMENTUM = 0.1
@@ -38,7 +38,7 @@ class Linear:
 
 @pytree_dataclass
 class TwoLayer:
-    """A network of one hidden layer: linear, ReLU, linear."""
+    """A network with one hidden layer: linear, ReLU, linear."""
 
     fc1: Linear
     fc2: Linear
@@ -82,7 +82,7 @@ class BatchNorm:
 
 
 def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
-    """Draw a linear layer like torch's `nn.Linear`: uniform within 1 / sqrt(d_in)."""
+    """Draw a linear layer like torch's `nn.Linear`: uniform within +- 1 / sqrt(d_in)."""
     return Linear(*_within(key, (d_in, d_out), fan=d_in, bias=bias))
 
 
@@ -97,7 +97,7 @@ def _within(
 
 
 def init_small_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
-    """Draw a linear layer of ViTs: normal of deviation 0.02, truncated at twice that; bias 0."""
+    """Draw a ViT's linear layer: normal of deviation 0.02, truncated at twice that; bias 0."""
     weight = random_init.truncated_normal(key, -2.0, 2.0, (d_in, d_out), scale=0.02)
     return Linear(weight, random_init.zeros(d_out) if bias else None)
 
@@ -110,19 +110,19 @@ def init_layer_norm(dim: int) -> LayerNorm:
 def init_depthwise_conv(
     key: PRNGKeyArray, kernel_size: int, dim: int, *, bias: bool = True
 ) -> DepthwiseConv:
-    """Draw filters like torch's `nn.Conv2d(groups=dim)`: uniform within 1 / kernel_size."""
+    """Draw filters like torch's `nn.Conv2d(groups=dim)`: uniform within +- 1 / kernel_size."""
     shape = kernel_size, kernel_size, dim
     return DepthwiseConv(*_within(key, shape, fan=kernel_size**2, bias=bias))
 
 
 def init_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
-    """Draw a convolution like torch's `nn.Conv2d`: uniform within 1 / sqrt(kernel_size^2 d_in)."""
+    """Draw like torch's `nn.Conv2d`: uniform within +- 1 / sqrt(kernel_size^2 d_in)."""
     shape = kernel_size, kernel_size, d_in, d_out
     return Conv(*_within(key, shape, fan=kernel_size**2 * d_in))
 
 
 def init_transposed_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
-    """Draw like torch's `nn.ConvTranspose2d`, whose fan-in counts the output channels."""
+    """Draw like torch's `nn.ConvTranspose2d`: within +- 1 / sqrt(kernel_size^2 d_out)."""
     shape = kernel_size, kernel_size, d_in, d_out
     return Conv(*_within(key, shape, fan=kernel_size**2 * d_out))
 
@@ -135,7 +135,7 @@ def init_batch_norm(dim: int) -> BatchNorm:
 
 
 def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Convert `x` to float32 at least.
+    """Convert `x` to float32, unless its type is wider.
 
     Elementwise work on bfloat16 is done in float32 and rounded once. Above all, operands that a
     parameter is broadcast over must be float32: the parameter's gradient is a sum over all tokens
@@ -163,23 +163,23 @@ def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*bat
 
 
 LinearUpdate = Callable[[str, Array], Array | None]
-"""Maps a linear layer's name and input to what an adapter adds to its output, if anything."""
+"""Function of a linear layer's name and input: what an adapter adds to its output, or None."""
 
 
 def no_update(name: str, x: Array) -> None:
-    """Add nothing to any layer."""
+    """Return None: add nothing to the output of any layer."""
 
 
 def adapted_linear(
     name: str, params: Linear, x: Float[Array, "*batch d_in"], update: LinearUpdate
 ) -> Float[Array, "*batch d_out"]:
-    """Map the last axis by `linear`, and add an adapter's update."""
+    """Apply `linear`, and add what `update` returns for the layer called `name`, if anything."""
     y, extra = linear(params, x), update(name, x)
     return y if extra is None else y + extra
 
 
 def columns(params: Linear, start: int, stop: int) -> Linear:
-    """Return the part of a layer that computes the outputs `start:stop`."""
+    """Return the part of a linear layer that computes the outputs `start:stop`."""
     return jax.tree.map(lambda x: x[..., start:stop], params)
 
 
@@ -317,7 +317,7 @@ def split_statistics(params: PyTree) -> tuple[PyTree, PyTree]:
         params: a pytree.
 
     Returns:
-        (statistics, rest): two trees of the same structure, with None for the other's leaves.
+        (statistics, rest): two trees of the same structure; each has None for the other's leaves.
 
     Example:
         >>> statistics, rest = split_statistics(init_batch_norm(2))
@@ -380,7 +380,7 @@ def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys) -> Float[Array
 
 
 def split_key(key: Keys, count: int) -> list[Keys]:
-    """Split one key, or each of several, into `count` keys; return Nones for None."""
+    """Split one key, or each of several, into `count` keys; for None, return a list of None."""
     if key is None:
         return [None] * count
     split = functools.partial(jax.random.split, num=count)
@@ -398,7 +398,7 @@ def l2_normalise(x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
 
 
 def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:
-    """Draw a network of one hidden layer, each layer as torch's `nn.Linear`."""
+    """Draw a network with one hidden layer, each layer like torch's `nn.Linear`."""
     first, second = random_init.split(key)
     return TwoLayer(init_linear(first, d_in, hidden), init_linear(second, hidden, d_out))
 
@@ -406,7 +406,7 @@ def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> Two
 def two_layer(
     params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: Keys
 ) -> Float[Array, "*batch d_out"]:
-    """Apply the network, with dropout of this rate before the ReLU if there is a key."""
+    """Apply the network, with dropout at this rate before the ReLU unless the key is None."""
     hidden = dropout(linear(params.fc1, x), rate, key=key)
     return linear(params.fc2, jax.nn.relu(hidden))
 

@@ -127,8 +127,8 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
         stored: whether they are to be saved, which needs unsplit, finite float32 arrays.
 
     Raises:
-        InputError: they do not match, and the first differences are listed; or the model computes
-            in float64 outside JAX's 64-bit mode.
+        InputError: params and config do not match (the first differences are listed), or the model
+            computes in float64 outside JAX's 64-bit mode.
 
     Example:
         >>> import jax
@@ -163,7 +163,7 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
 def cast_params(params: Any, config: ModelConfig) -> Any:
     """Cast the weights of the backbone's large linear layers to the type of their products.
 
-    Otherwise every call casts them. Descriptors stay the same, bit for bit. In bfloat16 the weights
+    Without this, every call casts them. Descriptors stay the same, bit for bit. In bfloat16 weights
     take half the memory and can no longer be trained; if XLA would widen them again in every call
     (`widens_slices`), they stay float32. In float64 all parameters are cast, so that no sum is
     rounded to float32.
@@ -261,7 +261,7 @@ def describe(
     `mask[i, j]` allows image i to attend to image j, and None allows all. An image that may attend
     to none attends to itself. See `self_mask` and `valid_mask`.
 
-    It supports `jax.jit`, `jax.vmap` and reverse mode (`jax.grad`, `jax.jacrev`), once or twice.
+    `jax.jit`, `jax.vmap` and reverse mode (`jax.grad`, `jax.jacrev`, once or twice) are supported.
     Forward mode (`jax.jvp`, `jax.hessian`) is not supported: attention and max pooling have custom
     gradients, for speed. For a Hessian, use `jax.jacrev` of `jax.grad`. On an accelerator, where
     attention is fused, the gradient can be taken only once.
@@ -277,7 +277,7 @@ def describe(
         micro_batch: see `extract_tokens`; images still attend to the whole batch.
 
     Returns:
-        Descriptors in float32 at least, of length 1 if the model has `unit_length`.
+        Descriptors in float32 at least, of length 1 if `config.unit_length`.
 
     Raises:
         InputError: the parameters do not match the configuration; or, while tracing, there are no
@@ -357,7 +357,7 @@ def tokens_and_statistics(
         params: see `describe`.
         images: see `describe`.
         config: see `describe`.
-        valid: images that the statistics are taken from; None uses the stored ones.
+        valid: mask of the images whose statistics are used; None uses the stored ones.
         key: see `describe`.
         micro_batch: see `extract_tokens`.
 
@@ -518,9 +518,9 @@ def _widened(params: Crisalad, config: ModelConfig) -> Crisalad:
 def unit_features(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch dim"]:
-    """Return the aggregator's patch features as unit vectors, for vocabularies.
+    """Return the aggregator's patch features, scaled to unit length, in float32 at least.
 
-    They are in float32 at least. Tokens that the aggregator inserts are left out of the backbone.
+    Arguments are those of `describe`. Tokens that the aggregator would insert are left out.
 
     Raises:
         InputError: what `describe` raises.
@@ -648,8 +648,8 @@ def attention_maps(
         The softmax of the scores, in float32 at least.
 
     Raises:
-        InputError: the backbone has no such block or no attention, or has adapters on a side path;
-            or what `describe` raises.
+        InputError: the backbone has no such block or no attention, or has adapters with prompts or
+            a side path; the aggregator inserts tokens; or what `describe` raises.
 
     Example:
         >>> import jax, numpy as np
@@ -735,15 +735,15 @@ def describe_training_batch(
         params: see `describe`.
         images: see `describe`.
         config: see `describe`.
-        valid: images that attend to each other; the others attend to themselves.
-        measured: images that batch norms take their statistics from; None uses the stored ones.
+        valid: mask of the images that attend to each other; the others attend to themselves.
+        measured: mask of the images whose statistics batch norms use; None uses the stored ones.
         key: random key for dropout; None means no dropout.
         micro_batch: see `extract_tokens`.
-        sub_batches: sizes of groups of consecutive images that attend to each other; empty if the
-            whole batch is one group.
+        sub_batches: sizes of groups of consecutive images that attend only to each other; empty if
+            the whole batch is one group.
 
     Returns:
-        (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them. The
+        (descriptors, tokens, statistics): `statistics` are as in `tokens_and_statistics`. The
         descriptors are unit vectors, as losses expect, even if the model does not normalise them.
     """
     tokens_key, cross_key = split_key(key, 2)
@@ -828,12 +828,12 @@ def params_of(arrays: Mapping[str, np.ndarray], config: ModelConfig, *, source: 
     """Build parameters from stored arrays, by their dotted names.
 
     Args:
-        arrays: unsplit, finite float32 arrays.
+        arrays: finite float32 arrays by name, such as "backbone.cls_token"; blocks are unsplit.
         config: the model's configuration.
-        source: the file, for messages.
+        source: name of the file, for messages.
 
     Raises:
-        InputError: they are not exactly the parameters of the model; the first differences are
+        InputError: the arrays are not exactly the model's parameters; the first differences are
             listed.
 
     Example:
@@ -851,12 +851,12 @@ def tree_of(arrays: Mapping[str, np.ndarray], template: _T, *, source: str) -> _
     """Build a tree from stored arrays, by their dotted names.
 
     Args:
-        arrays: finite arrays.
+        arrays: finite arrays by name.
         template: a tree of their shapes and types.
-        source: the file, for messages.
+        source: name of the file, for messages.
 
     Raises:
-        InputError: they do not match the template; the first differences are listed.
+        InputError: the arrays do not match the template; the first differences are listed.
     """
     names = named_leaves(template)
     problems = diff_trees(arrays, names) or not_finite(arrays)

@@ -14,7 +14,7 @@ from crisalad_jax.utils.errors import InputError
 LOCAL_WINDOW = 21
 """Side in pixels of the box of local contrast normalisation: one and a half patches."""
 LOCAL_NOISE = 0.02
-"""Smallest deviation, as a share of full scale, so that noise at night is not amplified."""
+"""Smallest standard deviation, for pixels from 0 to 1, so that noise at night is not amplified."""
 
 _BYTES_FROM = 30.0
 """Values above this are pixels from 0 to 255. ImageNet's normalisation gives at most 2.7, and that
@@ -33,10 +33,10 @@ def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) 
 
     Args:
         images: 8-bit pixels, or floats.
-        how: how they are normalised.
+        how: the preprocessing that normalised floats have had.
 
     Raises:
-        InputError: they are not an array, or are floats from 0 to 255 or from 0 to 1.
+        InputError: `images` are not an array, or are floats from 0 to 255 or from 0 to 1.
 
     Example:
         >>> import numpy as np
@@ -70,7 +70,7 @@ def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) 
 def normalise(
     image: UInt8[Array, "height width 3"], how: PreprocessingConfig
 ) -> Float[Array, "height width 3"]:
-    """Normalise one RGB image.
+    """Normalise one RGB image by the method `how.normalisation`.
 
     "mean-deviation" subtracts the mean and divides by the deviation, by default ImageNet's, as
     DINOv2 expects. "local-contrast" uses those of each pixel's 21 x 21 neighbourhood. It is for

@@ -14,16 +14,16 @@ from crisalad_jax.utils.target import target, widens_slices
 
 
 def product_precision(dtype: Any) -> jax.lax.Precision | None:
-    """Return the precision of a matrix product in `dtype`; None is JAX's setting.
+    """Return the precision of a matrix product in `dtype`; None is that of JAX's configuration.
 
-    A pass multiplies numbers of 8 bits exactly, so bfloat16 needs only one.
+    One pass of an accelerator multiplies numbers of 8 bits exactly, so bfloat16 needs only one.
     """
     single = dtype == jnp.bfloat16 and target().platform != "cpu"
     return jax.lax.Precision.DEFAULT if single else None
 
 
 def rule_precision(dtype: Any) -> str | None:
-    """Return the products' precision, for rules whose backward pass is traced outside its scope."""
+    """Return the current precision, for custom rules whose backward pass is traced without it."""
     if product_precision(dtype) is not None:
         return "default"
     return None if target().platform == "cpu" else jax.config.jax_default_matmul_precision  # pyright: ignore
@@ -39,7 +39,7 @@ def row_major(x: Array) -> Array:
 
 
 def keep(x: Array, name: str) -> Array:
-    """Name a result that a policy of `jax.checkpoint` saves for the gradient.
+    """Name a result, so that a policy of `jax.checkpoint` saves it for the gradient.
 
     Where XLA would widen everything saved in bfloat16 (`widens_slices`), its bits are saved.
     """
@@ -81,7 +81,7 @@ def map_first_axis(function: Callable[[Any], Array], stacks: Any) -> Array:
 
 
 def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:
-    """Multiply rows by a weight, which is cast to their type."""
+    """Multiply rows by a weight cast to their type; products of bfloat16 may be in float32."""
     dtype = rows.dtype
     if dtype == jnp.bfloat16 and target().platform == "cpu":
         return _narrow_matmul(rows, weight)
@@ -132,7 +132,7 @@ def convolve(
     stride: int,
     margin: int,
 ) -> Float[Array, "image rows columns d_out"]:
-    """Convolve images, padded with zeros, with a weight that is cast to their type."""
+    """Convolve images, padded with `margin` zeros per side, with a weight cast to their type."""
     convolution = functools.partial(
         jax.lax.conv_general_dilated, precision=product_precision(images.dtype)
     )

@@ -103,7 +103,7 @@ def truncated_normal(
 
 
 def split(key: PRNGKeyArray, num: int = 2) -> list[PRNGKeyArray]:
-    """Split a key as `jax.random.split` does, with the same program for every `num`."""
+    """Split a key as `jax.random.split` does, with the same program for every `num` up to 64."""
     return list(jax.random.split(key, max(num, _MOST_KEYS)))[:num]
 
 

@@ -1,4 +1,4 @@
-"""Torch's `nn.TransformerEncoderLayer`, post-norm, with any attention."""
+"""Torch's `nn.TransformerEncoderLayer`, post-norm, for attention that the caller computes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -21,7 +21,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class EncoderLayer:
-    """Attention and feed-forward network, with a layer norm after each."""
+    """Parameters of attention and feed-forward network, with a layer norm after each."""
 
     attn: Attention
     linear1: Linear
@@ -57,7 +57,7 @@ def encoder_layer(
         params: the layer, whose attention has already been applied.
         x: the tokens that went into the attention.
         attended: the attention's output.
-        activation: activation of the network's hidden layer.
+        activation: activation of the feed-forward network's hidden layer.
         rate: dropout rate of the attention's output, the hidden layer and the network's output.
         keys: random keys for these three dropouts; None means inference.
     """

@@ -25,7 +25,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float32, UInt8
 
 Bits = UInt8[np.ndarray, "n bytes"]
-"""Packed bits of n images, one row each."""
+"""Packed bits of n images, one row each: a byte for every eight dimensions."""
 _ROWS = 4096
 """Number of database rows compared at a time."""
 _PIECE = 2**16
@@ -36,13 +36,13 @@ def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8
     """Pack the signs of descriptors: a bit is 1 where a value is at least 0.
 
     The first dimension is the highest bit of the first byte, as in `numpy.packbits`. A value of 0
-    becomes 1, as in SelaVPR++; TeTRA differs only in that it becomes 0.
+    gives a bit of 1, as in SelaVPR++; the only difference in TeTRA is that it gives a bit of 0.
 
     Args:
         descriptors: descriptors of the n images, of any norm; d is a multiple of 8.
 
     Returns:
-        The packed bits, as `search` takes them.
+        The packed bits, which `search` accepts as they are.
 
     Raises:
         InputError: not a matrix of finite numbers, or d is not a multiple of 8.
@@ -59,7 +59,7 @@ def to_bits(array: np.ndarray, name: str, length: int) -> Bits:
     """Pack descriptors of `length` dimensions, or check them if they are packed already.
 
     Raises:
-        InputError: what `pack_bits` and `as_bits` raise.
+        InputError: what `pack_bits` and `as_bits` raise; the message calls the array `name`.
     """
     convert = as_bits if np.asanyarray(array).dtype == BITS else _packed
     return convert(array, name, length)
@@ -73,18 +73,18 @@ def _packed(array: np.ndarray, name: str, length: int | None = None) -> Bits:
 
 
 def check_packable(length: int, name: str) -> None:
-    """Raise InputError if descriptors of this many dimensions do not fill whole bytes."""
+    """Raise InputError if descriptors of `length` dimensions do not fill whole bytes."""
     require(length % 8 == 0, f"{name}: found {length} dimensions, expected a multiple of 8 as bits")
 
 
 def sign_vectors(bits: Bits) -> Float32[np.ndarray, "n d"]:
-    """Unpack bits to unit vectors of values +v and -v, whose cosines are the similarities."""
+    """Unpack bits into unit vectors of +v and -v, whose cosines are the similarities of bits."""
     size = np.float32(1 / np.sqrt(8 * bits.shape[1]))
     return np.where(np.unpackbits(bits, axis=1), size, -size)
 
 
 def as_bits(array: np.ndarray, name: str, length: int | None = None) -> Bits:
-    """Check that an array holds packed bits, of descriptors of `length` dimensions if given.
+    """Check that an array holds packed bits; if `length` is given, of that many dimensions.
 
     Raises:
         InputError: it is not a matrix of bytes, is empty, or is of another length.
@@ -101,7 +101,7 @@ def as_bits(array: np.ndarray, name: str, length: int | None = None) -> Bits:
 
 
 def search_bits(database: Bits, queries: Bits, k: int) -> Neighbours:
-    """Find the rows with the most bits in common with each query; see `retrieval.search`.
+    """Find the k rows with the most bits in common with each query, as `retrieval.search` does.
 
     Raises:
         InputError: arrays that are not packed bits of the same length.
@@ -115,7 +115,7 @@ def nearest_bits(database: Iterable[Bits], queries: Bits, k: int) -> Neighbours:
     """Find the k rows with the most bits in common with each query; ties go to lower indices.
 
     Args:
-        database: packed bits, part by part, at least k rows in all.
+        database: packed bits of the database in consecutive parts, with at least k rows in all.
         queries: packed bits.
         k: neighbours per query.
 

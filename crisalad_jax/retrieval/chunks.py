@@ -29,7 +29,7 @@ _SCATTERED = 4
 def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descriptors:
     """Check that an array is a matrix of descriptors, of `length` if given, and return a view.
 
-    NumPy has no name for bfloat16: a .npy file stores it as two untyped bytes ("V2").
+    Values of two untyped bytes ("V2"), as a .npy file stores bfloat16, are viewed as bfloat16.
 
     Raises:
         InputError: the array is not a matrix of real numbers, is empty, or is of another length.
@@ -61,7 +61,7 @@ def as_unit_rows(array: np.ndarray, name: str, length: int | None = None) -> Que
 
 
 def as_sides(database: np.ndarray, queries: np.ndarray) -> tuple[Descriptors, Descriptors]:
-    """Check that database and queries are matrices of descriptors of the same length.
+    """Check that database and queries hold descriptors of the same length, and return them.
 
     Raises:
         InputError: what `as_rows` raises.
@@ -71,12 +71,12 @@ def as_sides(database: np.ndarray, queries: np.ndarray) -> tuple[Descriptors, De
 
 
 class Block(NamedTuple):
-    """Some rows of an array."""
+    """Some rows of an array, in order."""
 
     start: int
     """Number of rows in the blocks before it."""
     rows: Float[np.ndarray, "size d"]
-    """In float32, unless requested otherwise."""
+    """The rows, in float32; with `narrow` in `blocks`, float16 and bfloat16 stay as they are."""
 
 
 def blocks(
@@ -88,7 +88,7 @@ def blocks(
     places: Int[np.ndarray, " m"] | None = None,
     narrow: bool = False,
 ) -> Generator[Block, None, None]:
-    """Check and yield the rows of an array in order, `size` at a time, if possible uncopied.
+    """Check and yield the rows of an array in order, `size` at a time, without copies if possible.
 
     Pages of a memory map are released after the next block is taken, so a stream may be read one
     block ahead.
@@ -98,8 +98,8 @@ def blocks(
         name: name of the array in messages.
         size: number of rows in a block; the last may have fewer.
         unit: whether rows must be of unit length, or only finite.
-        places: the rows to yield, in ascending order; None for all.
-        narrow: whether to leave float16 and bfloat16 as they are; other types become float32.
+        places: indices of the rows to yield, in ascending order; None yields all.
+        narrow: whether to leave float16 and bfloat16 as they are; else all rows become float32.
 
     Raises:
         InputError: a row is not finite, or not of unit length if required.
@@ -119,11 +119,11 @@ def blocks(
 
 
 def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
-    """Join consecutive blocks into blocks of about `size` rows, at most twice as many.
+    """Join consecutive blocks into larger ones of at least `size` rows, except the last.
 
     Args:
         stream: blocks of at most `size` rows.
-        size: number of rows.
+        size: minimum number of rows; a joined block has less than twice as many.
     """
     parts: list[Float[np.ndarray, "rows d"]] = []
     start = count = 0
@@ -138,7 +138,7 @@ def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
 
 
 def regrouped(parts: Iterable[Descriptors], size: int) -> Generator[Block, None, None]:
-    """Regroup consecutive arrays into blocks of about `size` rows, at most twice as many."""
+    """Regroup consecutive arrays into blocks of at least `size` rows, except the last."""
     pieces = (
         Block(0, part[start : start + size])  # `joined` sets the starts
         for part in parts
@@ -148,7 +148,7 @@ def regrouped(parts: Iterable[Descriptors], size: int) -> Generator[Block, None,
 
 
 def gathered(array: Descriptors, places: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m d"]:
-    """Read the rows at `places`, in ascending order, and release their pages."""
+    """Read the rows at `places`, which must be in ascending order, and release their pages."""
     parts = []
     for start in range(0, len(places), _SCATTERED):
         some = places[start : start + _SCATTERED]
@@ -163,7 +163,7 @@ def _widened(rows: np.ndarray) -> Float32[np.ndarray, "rows d"]:
 
 
 def sample(total: int, count: int, seed: int) -> Int[np.ndarray, " count"]:
-    """Draw `count` of `total` places at random, sorted so that disks are read in order."""
+    """Draw `count` indices below `total` at random, sorted so that disks are read in order."""
     return np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
 
 
@@ -174,12 +174,12 @@ def check_rows(
 
     Args:
         rows: descriptors.
-        name: where they are from.
-        places: their indices there, for the message.
+        name: name of the array that they are from, for the message.
+        places: indices of the rows in that array, for the message.
         unit: whether they must be of unit length, or only finite.
 
     Raises:
-        InputError: a row is not; the message gives the first.
+        InputError: a row fails the check; the message describes the first.
     """
     wide = _widened(rows)
     with np.errstate(over="ignore", invalid="ignore"):

@@ -47,8 +47,9 @@ def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image")
     """Resize an image as a model expects it, and normalise it unless the model takes bytes.
 
     Args:
-        image: 8-bit RGB, from `read_image`; or grey (height, width) or (height, width, 1), which is
-            repeated over the channels; or a type that `PreprocessingConfig.bit_depth` converts.
+        image: 8-bit RGB (height, width, 3), from `read_image`; or grey (height, width) or (height,
+            width, 1), repeated over the channels; or a type that `PreprocessingConfig.bit_depth`
+            converts to 8 bits.
         config: the model's configuration.
         name: name of the image, for messages.
 
@@ -83,7 +84,7 @@ def _as_list(name: str, given: Any) -> list[Any]:
 
 
 def check_readable(source: object, tried: int, readable: int) -> None:
-    """Raise InputError if none of the images of a source could be read."""
+    """Raise InputError if none of the `tried` images of a source could be read."""
     require(readable > 0, f"{source}: found {tried} images, none of them readable")
 
 
@@ -95,19 +96,19 @@ def describe_files(
     """Describe image files, each independently of the others.
 
     Files are decoded upright and resized according to the model's configuration. `extract` does the
-    same for folders, and writes files.
+    same for folders, and can write the descriptors to files.
 
     Args:
         model: a model from `load`, or a `Runtime`.
         files: an image file, or a list of them.
-        reading: how the files are read.
+        reading: how the files are read; `on_bad_image` says whether to skip unreadable ones.
 
     Returns:
-        A descriptor of each readable file, in order.
+        A descriptor of each readable file, in order; unit vectors if `model.config.unit_length`.
 
     Raises:
-        InputError: no files, one that cannot be read, or parameters that do not match the
-            configuration.
+        InputError: no files, an unreadable one that is not skipped, or parameters that do not match
+            the configuration.
 
     Example:
         >>> import jax
@@ -130,16 +131,15 @@ def describe_images(
     """Describe images in memory, each independently of the others.
 
     Batches are padded to powers of two, so few programs are compiled, and a single image is not
-    padded. Values differ from those of `describe_files` by rounding, as batch sizes differ.
+    padded. Values differ from those of `describe_files` by rounding, because batch sizes differ.
 
     Args:
         model: a model from `load`, or a `Runtime`.
-        images: 8-bit RGB, of any sizes, as `read_image` returns them, or grey; see
-            `prepare_image`.
+        images: 8-bit RGB, of any sizes, as `read_image` returns them, or grey; see `prepare_image`.
         batch_size: maximum number of images described together.
 
     Returns:
-        A descriptor of each image, in order.
+        A descriptor of each image, in order; unit vectors if `model.config.unit_length`.
 
     Raises:
         InputError: no images, or one that `prepare_image` does not accept or that the model cannot
@@ -162,7 +162,7 @@ def describe_images(
 def describe_prepared(
     describer: Describer, prepared: Sequence[Pixels], batch_size: int
 ) -> Float32[np.ndarray, "image descriptor"]:
-    """Describe images from `prepare_image`, each independently; see `describe_images`."""
+    """Describe images that `prepare_image` returned, each independently; see `describe_images`."""
     by_shape: dict[tuple[int, ...], list[int]] = {}
     for number, image in enumerate(prepared):
         by_shape.setdefault(image.shape, []).append(number)
@@ -196,16 +196,16 @@ def described(
     window: int = 1,
     components: Pca | None = None,
 ) -> Iterator[Described]:
-    """Describe images in order, each with the `window - 1` before it, and yield batch by batch.
+    """Describe images in order, batch by batch, each with the `window - 1` before it.
 
-    The descriptors are those of the grouping `window`, or `single` if the window is 1, of the
-    images that could be read. Memory holds two batches, and the images that are read ahead. With a
-    window of 1, components reduce whole batches, so that the bits of a descriptor do not depend on
-    which other images could be read.
+    Images that cannot be read are left out. The grouping is "window", or "single" for a window of
+    1. Memory holds two batches, and the images that are read ahead. `components` shorten the
+    descriptors. With a window of 1 they shorten whole batches, so that the bits of a descriptor do
+    not depend on which other images could be read.
 
     Raises:
-        InputError: an image cannot be read and `reading` says "stop"; or what
-            `FrameDescriber` raises.
+        InputError: an image cannot be read and `reading` says "stop"; or what `FrameDescriber`
+            raises.
     """
     shorten = (lambda rows: rows) if components is None else components.apply
     frames = FrameDescriber(describer, window)
@@ -245,7 +245,7 @@ def _each_batch(
 def shown(
     stream: Iterator[Described], label: str, total: int, *, quiet: bool, done: int = 0
 ) -> Iterator[Described]:
-    """Pass descriptors through, and show the number of finished images in a progress bar."""
+    """Pass descriptors through, and show a progress bar that starts at `done` of `total` images."""
     with progress_bar(label, total, "images", quiet=quiet, done=done) as bar:
         for part in stream:
             yield part
@@ -253,7 +253,7 @@ def shown(
 
 
 def joined(stream: Iterator[Described], size: int) -> Iterator[Described]:
-    """Join parts until they have `size` descriptors; the last one may have fewer, or none."""
+    """Join parts until they have at least `size` descriptors; the last may have fewer, or none."""
     waiting: list[Described] = []
     for part in stream:
         waiting.append(part)
@@ -272,13 +272,13 @@ def concatenated(parts: Sequence[Described]) -> Described:
 def readable(
     stream: Iterator[Described], size: int, items: Sequence[_T], unreadable: list[_T]
 ) -> Iterator[tuple[list[_T], Rows]]:
-    """Yield the items of the images that could be read, and their descriptors, as `joined` does.
+    """Yield items and descriptors of the images that could be read, at least `size` at a time.
 
     Args:
-        stream: descriptors.
-        size: number of descriptors to join.
-        items: items of all images, such as their names.
-        unreadable: the items of the other images are appended to it.
+        stream: descriptors of the images, in order.
+        size: minimum number of descriptors to join.
+        items: an item for each image, such as its name.
+        unreadable: a list, to which the items of unreadable images are appended.
     """
     for part in joined(stream, size):
         unreadable.extend(items[index] for index in part.unreadable)
@@ -287,7 +287,7 @@ def readable(
 
 
 class TokenSet:
-    """The tokens of images in memory, from which they are described under any grouping."""
+    """Tokens of images in memory, from which the images are described under any grouping."""
 
     def __init__(
         self,
@@ -303,12 +303,12 @@ class TokenSet:
         self._describer, self._reading, self._label = describer, reading, label
 
     def batches(self, grouping: str, batch_size: int | None, seed: int = 0) -> Batches:
-        """Group the readable images; the default batch size is the one they were read in."""
+        """Group the readable images; a batch size of None is the one they were read in."""
         size = batch_size or self._reading.batch_size
         return batches_of(len(self.rows), grouping, size, seed)
 
     def describe(self, batches: Batches) -> Float[np.ndarray, "image descriptor"]:
-        """Return the descriptors of the readable images in batches."""
+        """Return the descriptors of the readable images, grouped in these batches."""
         options = {"label": self._label, "quiet": self._reading.quiet}
         return group(self._describer, self.rows, batches, **options)
 
@@ -316,7 +316,7 @@ class TokenSet:
 def group(
     describer: Describer, rows: Rows, batches: Batches, **options: Any
 ) -> Float[np.ndarray, "image descriptor"]:
-    """Describe images in batches, and return them in order; options are those of `grouped`."""
+    """Return descriptors of images in batches, in image order; options are those of `grouped`."""
     descriptors = np.empty((len(rows), describer.config.descriptor_dim), np.float32)
     for images, found in grouped(describer, rows, batches, **options):
         descriptors[images] = found
@@ -337,8 +337,8 @@ def grouped(
     Args:
         describer: the model.
         rows: the tokens of the images, by index.
-        batches: which images attend to each other.
-        first: the first batch to describe.
+        batches: the images that attend to each other.
+        first: index of the first batch to describe.
         label: label of the progress bar.
         quiet: whether to hide the progress bar.
     """

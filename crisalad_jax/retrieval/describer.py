@@ -1,6 +1,6 @@
 """One interface to models that describe images, in JAX or in another engine.
 
-Nothing here imports JAX: `jax_describer` does, if a JAX model is given.
+JAX is imported only through `jax_describer`, if a JAX model is given.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,25 +19,25 @@ if TYPE_CHECKING:  # an engine describes images without JAX
     from crisalad_jax.nn.model import Model
 
 Rows = Float[np.ndarray, "image token_numbers"]
-"""The tokens of some images, one row each, which only the describer's `attend` reads."""
+"""Tokens of some images, one row each, in a form that only the describer's `attend` reads."""
 
 
 class Describer(Protocol):
-    """A model that describes images in two steps: the tokens of each, then their descriptors."""
+    """A model that describes images in two steps: tokens of each image, then descriptors."""
 
     config: "ModelConfig"
     """The model's configuration."""
     preparation: Preparation
-    """How images are prepared."""
+    """How images are resized and normalised."""
     digest: str
-    """The `model_hash` of the model."""
+    """The `model_hash` of the model: a SHA-256 of its parameters and configuration."""
     row_length: int
     """Number of values in the row of an image's tokens."""
     row_dtype: str
     """Type of the values in rows of tokens."""
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
-        """Yield each batch with the tokens of its images, padding included, in order."""
+        """Yield the tokens of each batch's images, padding included, and the batch, in order."""
         ...
 
     def attend(
@@ -58,12 +58,12 @@ def describer_of(
     """Check a model, and return a describer for it.
 
     Args:
-        model: parameters and configuration, or a model in another engine.
-        groupings: the groupings that it must support, each as `Grouping.parse` takes it.
+        model: parameters and configuration (`Model`), a model in another engine, or a describer.
+        groupings: the groupings that it must support, in the syntax of `Grouping.parse`.
 
     Raises:
-        InputError: the parameters do not match the configuration; or the engine's program is for
-            other groupings.
+        InputError: not a model; parameters that do not match the configuration; or a program of an
+            engine that is for other groupings.
     """
     if isinstance(model, Runtime):
         model.check_groupings(groupings)

@@ -52,7 +52,7 @@ def read_record(path: pathlib.Path) -> dict[str, Any]:
 
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:
-    """List all files of a set of descriptors in `path`.
+    """List the files of descriptors in `path`: the file itself, that of the names, and the record.
 
     Raises:
         InputError: the suffix is neither .npy nor .h5.
@@ -76,18 +76,18 @@ def write_descriptors(
     within: pathlib.Path | None = None,
     written: pathlib.Path | None = None,
 ) -> None:
-    """Write descriptors, the names of their images and a record of both.
+    """Write descriptors, the names of their images and a record of how they were made.
 
     All files are written completely under temporary names. Then the record is renamed, and after it
-    the others. A process killed in between leaves a set whose digests differ from its record, which
+    the others. A process killed in between leaves files whose digests differ from the record, which
     `read_descriptors` refuses.
 
     Args:
         path: a .npy or .h5 file.
         descriptors: a row for each image.
         names: names of the images.
-        record: how they were made, as JSON values.
-        within: a folder for temporary files, see `files.atomic_path`.
+        record: how they were made, as JSON values; None records only the digests of the files.
+        within: a folder for temporary files (`files.atomic_path`); None is that of `path`.
         written: a .npy file of the descriptors on the same disk, to be moved instead of copied.
 
     Raises:
@@ -120,12 +120,12 @@ def write_rows(
 ) -> None:
     """Write a .npy file of float32 rows, which arrive in any order, some at a time.
 
-    With a memory map, a full disk would kill the process; this raises OSError.
+    A full disk raises OSError. With a memory map, it would kill the process.
 
     Args:
         path: the file.
         shape: number of rows, and their length.
-        parts: the places of some rows, and the rows.
+        parts: pairs of row indices, and the rows to write there.
     """
     header = npy_header(np.dtype(np.float32), shape)
     with path.open("wb") as file:
@@ -180,7 +180,7 @@ def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptor
 
     Args:
         path: the file.
-        verify: whether to read the file, and compare it with the digest in its record.
+        verify: whether to compare the whole file with the digest in its record, if it has one.
 
     Raises:
         InputError: the file does not exist, does not hold a matrix of such numbers, or does not
@@ -206,12 +206,12 @@ def read_descriptors(
 ) -> tuple[list[str], Descriptors]:
     """Read names and descriptors of any float type, from `write_descriptors` or hloc.
 
-    A .npy file is memory-mapped: its rows are read when they are used. A warning reports a set
-    without a record of its digests.
+    A .npy file is memory-mapped: its rows are read when they are used. If the files have no record
+    of their digests, a warning says so.
 
     Args:
-        path: the file.
-        verify: whether to read the files, and compare them with their digests.
+        path: a .npy or .h5 file.
+        verify: whether to read the files completely, and compare them with their digests.
 
     Raises:
         InputError: the file, or the names next to a .npy, is missing, incomplete, from another set,

@@ -91,8 +91,8 @@ def extract(
 ) -> Extracted:
     """Describe images, and write the descriptors to `out` if it is given.
 
-    With `out`, repeating a killed call resumes it, and only one process at a time may write there.
-    While it runs, tokens and descriptors are in files; memory holds a few hundred images' worth.
+    With `out`, the same call resumes after a kill, and only one process at a time may write there.
+    While it runs, tokens and descriptors are in files; memory holds those of a few hundred images.
 
     Args:
         model: a model from `load`, or a `Runtime`.
@@ -100,18 +100,18 @@ def extract(
             (docs/how-to/image-sources.md), or a list of files.
         out: a .npy file, with the names in a second file, or an .h5 file as hloc reads it. A JSON
             file next to it records how it was made. None writes nothing.
-        fps: frames per second, if `images` is a video or log; None is 1.
+        fps: frames per second to take from a video or robot log; None is 1.
         topic: the image topic of a robot log; None uses the only one.
         positions: where images were taken, for `every_metres`, as in `index`.
-        every_metres: minimum distance of an image from the last selected one of its folder or
-            video, as in `index`. None selects all.
-        weights: the file of the parameters, for the JSON file and for messages.
-        grouping: one of `GROUPINGS`: which images attend to each other.
+        every_metres: minimum distance in metres from the last selected image of the same folder or
+            video, as in `index`. None selects all images.
+        weights: the file that the parameters come from, for the JSON file and for messages.
+        grouping: which images attend to each other; one of `GROUPINGS`.
         seed: random seed of the order in the grouping "shuffled".
-        root: folder that names are relative to; by default the folder `images`, or that of another
-            source. Without a root, files of a list are named by their paths.
-        pca: components that reduce the descriptors, or a file of them.
-        verify: whether to check `pca` against its checksum.
+        root: folder that names are relative to. None is the folder `images`, or that of another
+            source; files of a list are then named by their paths.
+        pca: components from `fit_pca` that shorten the descriptors, or their file; None uses none.
+        verify: whether to check the file `pca` against its checksum.
         reading: how images are read.
         cluster: the Ray cluster that describes them (extra `ray`): "local", "auto",
             "ray://HOST[:PORT]" or "HOST:PORT" (docs/how-to/ray.md). None uses this process.
@@ -120,9 +120,9 @@ def extract(
         Names and descriptors of the images that could be read.
 
     Raises:
-        InputError: what `describer_of`, `check_extraction` and `connected` raise; components of
-            another length; no images, an unreadable image, or no readable one; a name that is not a
-            line of text or is not under `root`; or a file that cannot be read or written.
+        InputError: parameters or components that do not fit the model; an invalid argument; no
+            cluster at the address; no images, an unreadable image, or no readable one; a name that
+            is not a line of text or is not under `root`; or a file that cannot be read or written.
 
     Example:
         >>> import jax
@@ -189,8 +189,8 @@ def check_extraction(out: StrPath | None, *, grouping: str, seed: int, cluster: 
         cluster: the address of a Ray cluster.
 
     Raises:
-        InputError: an unknown suffix or grouping; a file that cannot be created; or a number out of
-            range.
+        InputError: an unknown suffix or grouping; a file that cannot be created; a number out of
+            range; or an invalid address of a cluster.
 
     Example:
         >>> check_extraction("descriptors.npy", grouping="single", seed=0, cluster=None)

@@ -1,9 +1,9 @@
 """Approximate search with FAISS, for databases that are too large for exact search.
 
 A graph (HNSW: Malkov and Yashunin, 2018) stores the descriptors as they are and finds nearly all
-neighbours. IVF-RaBitQ (Gao and Long, 2024) stores one bit per dimension, and compares the bits in
-the lists nearest to a query; rank its results again by exact similarities. `recall_against_exact`
-measures the share that either finds. Reduce descriptors of thousands of dimensions first (`pca`).
+neighbours. IVF-RaBitQ (Gao and Long, 2024) stores one bit per dimension in lists of similar
+vectors, and compares only the lists nearest to a query; rank its results again.
+`recall_against_exact` measures the share found. Reduce thousands of dimensions first (`pca`).
 """
 
 import hashlib
@@ -29,8 +29,8 @@ from crisalad_jax.utils.shapes import Float, Int
 faiss: Any = _faiss  # its classes are created at import
 Kind = Literal["hnsw", "ivf-rabitq"]
 KINDS: dict[str, None] = dict.fromkeys(get_args(Kind))
-"""A graph over the unchanged descriptors, nearly exact and as large as they are; or lists of their
-signs, 80 bytes each for 512 dimensions, whose results should be ranked again."""
+"""A graph over the unchanged descriptors ("hnsw"), nearly exact and as large as they are; or lists
+of their signs ("ivf-rabitq"), 80 bytes each for 512 dimensions, to be ranked again."""
 _LINKS = 32
 """Number of links of a vector in each layer of the graph; twice as many in the lowest. FAISS
 recommends 4 to 64 and the paper 5 to 48, with more for longer vectors."""
@@ -68,17 +68,17 @@ class Index(NamedTuple):
         *,
         without: Int[np.ndarray, " rows"] | None = None,
     ) -> Neighbours:
-        """Find the most similar descriptors of each query, approximately.
+        """Find the descriptors most similar to each query, approximately.
 
         If fewer than k are found, the last indices are -1 and their similarities -inf. The
         similarities of IVF-RaBitQ are estimates.
 
         Args:
             queries: unit descriptors.
-            k: number of neighbours per query.
+            k: number of neighbours per query; all descriptors if there are fewer.
             effort: how much to search; more finds more and takes longer. For HNSW, the number of
-                candidates (the larger of 128 and 2 k by default); for IVF-RaBitQ, the number of
-                lists (the larger of 256 and a sixteenth of them by default).
+                candidates (by default the larger of 128 and 2 k); for IVF-RaBitQ, the number of
+                lists (by default the larger of 256 and a sixteenth of all lists).
             without: indices to exclude; None excludes none.
 
         Raises:
@@ -111,8 +111,8 @@ class Index(NamedTuple):
         """Append descriptors, some rows at a time.
 
         Args:
-            parts: unit descriptors.
-            count: total number of rows, for the progress bar.
+            parts: arrays of unit descriptors.
+            count: total number of rows in all parts, for the progress bar.
             quiet: whether to hide the progress bar.
 
         Raises:
@@ -124,23 +124,23 @@ class Index(NamedTuple):
                 bar.advance(len(part))
 
     def has_room_for(self, count: int) -> bool:
-        """Return whether an index of `count` descriptors would have at most twice as many lists."""
+        """Return whether a new index of `count` descriptors would at most double the lists."""
         index = self.faiss_index
         return self.kind == "hnsw" or 2 * _lists(index).nlist >= _list_count(count, index.d)
 
 
 Parts = Callable[[], Iterable[Float[np.ndarray, "rows d"]]]
-"""Yields descriptors some rows at a time, each time it is called."""
+"""A function that yields all descriptors, some rows at a time, whenever it is called."""
 
 
 def build(kind: Kind, database: Descriptors | Parts, *, seed: int = 0, quiet: bool = True) -> Index:
-    """Build an index of unit descriptors, which may be a memory map, reading some at a time.
+    """Build an index of unit descriptors, reading some at a time.
 
     IVF-RaBitQ rotates vectors by random signs and Hadamard matrices, so that no dimension counts
-    more than others. It has 4 sqrt(n) lists (the FAISS guidelines say 4 to 16 sqrt(n)), or fewer,
-    so that each is trained from 39 vectors. The training sample is random, at most 1 GiB of
-    descriptors. A descriptor takes one bit per dimension, rounded up to the next power of two, plus
-    8 bytes for two factors and 8 for its index.
+    more than others. For n descriptors it has 4 sqrt(n) lists (the FAISS guidelines say 4 to 16
+    sqrt(n)), or fewer, so that each is trained from 39 vectors. The training sample is random, at
+    most 1 GiB of descriptors. A descriptor takes one bit per dimension, rounded up to the next
+    power of two, plus 8 bytes for two factors and 8 for its index.
 
     HNSW has 32 links per vector. Its graph, and therefore the few neighbours that it misses, depend
     on the order in which threads insert vectors. With one thread (OMP_NUM_THREADS=1) the graph
@@ -148,7 +148,7 @@ def build(kind: Kind, database: Descriptors | Parts, *, seed: int = 0, quiet: bo
 
     Args:
         kind: one of `KINDS`.
-        database: unit descriptors, as `retrieval.search` takes them; or a function that yields them
+        database: unit descriptors (n, d), which may be a memory map; or a function that yields them
             in parts, which is called for each of up to three passes.
         seed: seed of the clustering and its sample, or of the graph's layers.
         quiet: whether to hide the progress bar.
@@ -228,7 +228,7 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
 
 
 def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
-    """Read an index that `save_index` wrote; warn of a missing checksum.
+    """Read an index that `save_index` wrote; warn if its checksum is missing.
 
     Args:
         path: the file.
@@ -260,7 +260,7 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
 
 
 def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "q k"]) -> float:
-    """Measure the share of the exact neighbours that a search found over all queries, 0 to 1.
+    """Measure the share, 0 to 1, of the exact neighbours of all queries that a search found.
 
     Args:
         found: indices from an approximate search.

@@ -1,6 +1,6 @@
 """Grouping protocols: which images attend to each other in the cross-image encoder.
 
-With such a model, the descriptor of an image depends on the images that it attended to. A recall
+With such an encoder, the descriptor of an image depends on the images that it attended to. A recall
 therefore means nothing without its protocol, for queries and for the database.
 """
 
@@ -20,7 +20,7 @@ GROUPINGS = {
     "sequential": "batches of images in file order: neighbours help each other",
     "window": "every image with those just before it in file order, as from a moving camera",
 }
-"""Groupings of the images of one side, queries or database. The two sides never mix."""
+"""Groupings of one side (queries or database), and what they do. The two sides never mix."""
 
 MASKED = "masked"
 """The batches of `sequential`, in which an image does not attend to others of the same place. This
@@ -28,16 +28,16 @@ needs the ground truth, so only an evaluation can use it."""
 _WORDS = GROUPINGS | {MASKED: "as sequential, but no image sees another of the same place"}
 
 DEFAULT_GROUPINGS = ("single", "shuffled", "sequential", "window/single")
-"""The last is for a robot, with its latest frames and a map of images described independently."""
+"""Default groupings; in the last, a robot's latest frames query a map of single images."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Grouping:
     """A protocol: one of `GROUPINGS` or `MASKED` for the queries and one for the database.
 
-    `window` assumes that files are in temporal order. That holds for numbered frames, but @UTM
-    names are sorted by easting. A database under `window` is a map whose images were described one
-    by one as they were recorded.
+    `window` assumes that files are in temporal order. That holds for numbered frames, but not for
+    @UTM names, which are sorted by easting. A database under `window` is a map whose images were
+    described as they were recorded, each with those just before it.
     """
 
     queries: str
@@ -49,7 +49,7 @@ class Grouping:
     def parse(cls, text: str) -> "Grouping":
         """Parse "window/single", for queries and database, or "single", for both.
 
-        A size may follow, as in "sequential@26".
+        A number of images may follow, as in "sequential@26"; see `batch_size`.
 
         Raises:
             InputError: an unknown grouping, more than two, or an invalid size.
@@ -82,7 +82,7 @@ def grouping_words(groupings: Iterable[str]) -> str:
         groupings: some of `GROUPINGS`, or `MASKED`.
 
     Returns:
-        A clause for each, in order.
+        A clause for each, in order, separated by semicolons.
 
     Example:
         >>> grouping_words(["single"])
@@ -104,16 +104,16 @@ class Batches(NamedTuple):
     """All queries or all database images in batches, and which descriptors to take from each."""
 
     images: Int64[np.ndarray, "batch place"]
-    """Indices of the images of each batch; a padding place repeats one of them."""
+    """Indices of the images at the places (slots) of a batch; padding repeats one of them."""
     filled: Bool[np.ndarray, "batch place"]
     """Whether a place holds an image rather than padding."""
     kept: Bool[np.ndarray, "batch place"]
-    """Whether to take the descriptor at a place; each image's is taken from exactly one batch."""
+    """Whether to take the descriptor at a place; each image has exactly one such place."""
     grouping: str
     """One of `GROUPINGS`, or `MASKED`; under "single" each image attends only to itself."""
 
     def part(self, start: int, stop: int) -> "Batches":
-        """Return batches `start` to `stop`."""
+        """Return the batches from `start` to just before `stop`."""
         images, filled, kept = (each[start:stop] for each in self[:3])
         return Batches(images, filled, kept, self.grouping)
 
@@ -128,14 +128,14 @@ class Batches(NamedTuple):
 
 
 def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Batches:
-    """Split images 0 to `count` into batches under one of `GROUPINGS`.
+    """Split `count` images into batches under one of `GROUPINGS`.
 
     Under `window`, image i has its own batch: the last `batch_size` images up to and including i
     (fewer for the first images). Only the descriptor of i is taken. One long batch with a banded
     mask would not work: over several layers, information from before the window would leak in.
 
     Args:
-        count: number of images of the side.
+        count: number of queries, or of database images.
         grouping: how they are grouped.
         batch_size: number of images that attend to each other.
         seed: random seed of the order in `shuffled`.

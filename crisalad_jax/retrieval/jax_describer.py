@@ -58,7 +58,7 @@ class JaxDescriber:
         return model_hash(self._given, self.config)
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
-        """Yield each batch with its images' tokens; the devices compute one batch ahead."""
+        """Yield the tokens of each batch, and the batch; devices compute one batch ahead."""
 
         def dispatched() -> Iterator[tuple[jax.Array, ImageBatch] | None]:
             for batch in batches:

@@ -1,4 +1,4 @@
-"""Exact nearest neighbours in any number of descriptors, without JAX."""
+"""Exact nearest-neighbour search in any number of descriptors, without JAX."""
 
 import itertools
 import math
@@ -15,7 +15,7 @@ from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
 
 QUERY_CHUNK = 1024
-"""Queries compared at a time: with 4,096 database rows their products are 16 MiB."""
+"""Number of queries compared at a time; their products with 4,096 rows take 16 MiB."""
 _SPARE = 16
 """Extra candidates beyond k, for products that float32 cannot distinguish."""
 _PIECE = 2**17
@@ -30,7 +30,7 @@ _LEAST = -2.0
 
 @brief
 class Neighbours(NamedTuple):
-    """The most similar database images of each query, best first."""
+    """The most similar database images of each query, best first, by index into the database."""
 
     indices: Int64[np.ndarray, "q k"]
     similarities: Float32[np.ndarray, "q k"]
@@ -46,13 +46,13 @@ class Neighbours(NamedTuple):
 
 
 class Products(NamedTuple):
-    """Float32 products of database rows with some queries."""
+    """Inner products of some database rows with consecutive queries, in float32."""
 
     first: int
     """Index of the first query."""
     values: Float32[np.ndarray, "row q"]
     indices: Int64[np.ndarray, "row _"]
-    """Database index of each row: (row, 1), or (row, q) where it differs from query to query."""
+    """Database indices of the rows: (row, 1), or (row, q) if each query has its own rows."""
 
 
 class _Pairs(NamedTuple):
@@ -64,16 +64,16 @@ class _Pairs(NamedTuple):
 
 
 Stream = Callable[[], Generator[Block, None, None]]
-"""Yields all blocks of a database each time it is called."""
+"""A function that yields all blocks of a database, from the first, each time it is called."""
 ReadRows = Callable[[Int64[np.ndarray, " m"]], Float[np.ndarray, "m d"]]
-"""Reads database rows by index, in ascending order."""
+"""A function that reads the database rows at some indices, which are in ascending order."""
 
 
 def rounding(length: int) -> float:
-    """Bound the rounding error of a float32 product of descriptors, in any summation order.
+    """Bound the rounding error of float32 inner products of unit descriptors of this length n.
 
-    This is the probabilistic bound of Higham and Mary (2019), lambda sqrt(n) u, with lambda = 8: it
-    fails less than once in 10^9 products. The sum of |a_i b_i| is at most the product of the norms.
+    For any order of summation, it is the product of the norms times 8 sqrt(n) 2^-24: the bound of
+    Higham and Mary (2019) with lambda = 8, which fails less than once in 10^9 products.
     """
     return 8 * math.sqrt(length) * 2.0**-24 * (1 + UNIT_TOLERANCE) ** 2
 
@@ -84,7 +84,7 @@ def exact_similarities(
     query: Int[np.ndarray, " pair"],
     row: Int[np.ndarray, " pair"],
 ) -> Float32[np.ndarray, " pair"]:
-    """Compute products of pairs in float64, in a fixed summation order, rounded to float32."""
+    """Compute queries[query] . rows[row] by pair, in float64 in a fixed order, as float32."""
     similarities = np.empty(len(query), np.float32)
     size = max(1, _PIECE // queries.shape[1])
     for start in range(0, len(query), size):
@@ -101,7 +101,7 @@ def similarities_of(
     index: Int[np.ndarray, " pair"],
     read_rows: ReadRows,
 ) -> Float32[np.ndarray, " pair"]:
-    """Compute `exact_similarities` for any rows of a database, read in database order."""
+    """Compute `exact_similarities` of queries[query] and the database rows at `index`."""
     similarities = np.empty(len(query), np.float32)
     order = np.argsort(index, kind="stable")
     size = max(1, _READ // queries.shape[1])
@@ -127,7 +127,7 @@ def similarities_of(
 def multiply(
     stream: Generator[Block, None, None], queries: Queries, size: int
 ) -> Generator[Products, None, None]:
-    """Multiply all queries with all blocks, of at most `size` rows, in NumPy."""
+    """Multiply all queries with all blocks, of at most `size` rows; results reuse two buffers."""
     # Allocating memory takes longer than writing the products. Two buffers, for `one_ahead`.
     shape = size, min(QUERY_CHUNK, len(queries))
     memory = itertools.cycle([np.empty(shape, np.float32) for _ in range(2)])
@@ -148,9 +148,9 @@ def nearest(
     size: int,
     products: Callable[[int], Generator[Products, None, None]] | None = None,
 ) -> Neighbours:
-    """Find the k most similar rows of each query, exactly; ties go to the lower indices.
+    """Find the k most similar rows for each query, exactly; ties go to the lower indices.
 
-    The candidates of a query are its largest float32 products, somewhat more than k. Those that may
+    The candidates of a query are the k + 16 rows with its largest float32 products. Those that may
     be among the k best, given the rounding error, are compared by `exact_similarities`. If other
     rows may be too, as with many copies of an image, the database is read again, and all rows whose
     products are close to the k-th similarity are compared exactly.
@@ -161,8 +161,8 @@ def nearest(
         k: neighbours per query.
         read_rows: reads rows of the database.
         size: maximum number of rows in a block.
-        products: yields products of all queries with all blocks, at least the given number of the
-            largest ones of each block; None multiplies in NumPy.
+        products: given a number m, yields products of all queries with all blocks, at least the m
+            largest of each query and block; None computes all products in NumPy.
     """
     margin = np.float32(2 * rounding(queries.shape[1]))
     width = k + _SPARE
@@ -191,7 +191,7 @@ def nearest(
 
 
 def best_products(products: Generator[Products, None, None], queries: int, k: int) -> Neighbours:
-    """Find the k largest of some exact products of each query; ties go to the lower indices.
+    """Find the k largest of some exact products for each query; ties go to the lower indices.
 
     Args:
         products: products of all queries with at least k rows, in row order.

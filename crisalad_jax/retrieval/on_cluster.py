@@ -1,4 +1,4 @@
-"""Describe images here, or on a Ray cluster whose nodes read them and return descriptors."""
+"""Describe images in this process, or on a Ray cluster whose nodes read and describe them."""
 
 import dataclasses
 import functools
@@ -22,7 +22,7 @@ from crisalad_jax.utils.host import usable_cores
 
 
 class Describing(NamedTuple):
-    """A model and settings to describe a list of images independently."""
+    """A model and settings for describing images, each independently of the others."""
 
     describer: Describer
     reading: Reading
@@ -33,13 +33,13 @@ class Describing(NamedTuple):
     def stream(
         self, paths: Sequence[pathlib.Path], address: str | None = None
     ) -> Iterator[Described]:
-        """Describe images in order, in this process or on the cluster at an address.
+        """Describe images in order, on the cluster at an address or, for None, in this process.
 
-        The batches are the same either way, and on machines of one kind so are the bits.
+        Batches are the same in both cases; on machines of one kind, results are bit-identical.
 
         Raises:
-            InputError: what `described` raises, or `cluster.connected`, `check_nodes` and
-                `map_in_order`; or a node cannot read an image that this machine can.
+            InputError: an image cannot be read and `reading` says "stop"; the cluster cannot be
+                joined or fails; or a node lacks this package or a file that this machine can read.
         """
         if address is not None and paths:
             return self._on_cluster(paths, address)
@@ -65,7 +65,7 @@ class Describing(NamedTuple):
                 yield part
 
     def piece(self, given: tuple[int, Sequence[pathlib.Path]]) -> Described:
-        """Describe consecutive images on a node, given the index of the first and their paths."""
+        """Describe consecutive images, given as (index of the first, paths), on a cluster node."""
         first, paths = given
         own = dataclasses.replace(self.reading, threads=usable_cores())
         found = concatenated(list(self._replace(reading=own).stream(paths)))

@@ -1,4 +1,4 @@
-"""Principal components of descriptors: fewer dimensions, with or without whitening."""
+"""Reduce descriptors to their principal components, with or without whitening."""
 
 import dataclasses
 import hashlib
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from crisalad_jax.retrieval.describer import Describer
 
 FORMAT = "crisalad-jax pca 2"
-"""The only metadata key of a file; its value is JSON: the file's checksum and the `PcaConfig`."""
+"""The only metadata key of a file of components; its JSON value has the checksum and settings."""
 SAMPLES = 2**14
 """Maximum number of descriptors that components are fitted to, as in CricaVPR."""
 _ARRAYS = ("mean", "components", "variances", "total")
@@ -34,15 +34,15 @@ _CHUNK_BYTES = 2**26
 
 @dataclasses.dataclass(frozen=True)
 class PcaConfig:
-    """How descriptors are reduced to their components."""
+    """What happens to descriptors after their projection onto the components."""
 
     whiten: bool = False
-    """Divide every component by its standard deviation, so all weigh the same (Jegou and Chum,
-    2012). CricaVPR does not."""
+    """Divide every component by its standard deviation, so that all have the same variance (Jegou
+    and Chum, 2012). CricaVPR does not whiten."""
     renormalise: bool = True
-    """Normalise the reduced descriptors to unit length again, as `retrieval.search` and all cosine
-    comparisons expect (and as Jegou and Chum do after whitening). CricaVPR does not, and searches
-    by L2: its published figures are without it."""
+    """Normalise the reduced descriptors to unit length again, as `search` and all cosine
+    comparisons expect (and as Jegou and Chum do after whitening). CricaVPR's published figures are
+    without this step: it searches by Euclidean distance."""
 
     def __post_init__(self) -> None:
         """Check the types."""
@@ -55,7 +55,7 @@ class Pca(NamedTuple):
 
     mean: Float32[np.ndarray, " d"]
     components: Float32[np.ndarray, "dim d"]
-    """Orthonormal rows by descending variance; the entry of largest magnitude is positive."""
+    """Orthonormal rows by descending variance, each with a positive entry of largest magnitude."""
     variances: Float32[np.ndarray, " dim"]
     """Sample variances (divided by n - 1) of the fitted descriptors along the components."""
     total: Float32[np.ndarray, ""]
@@ -70,7 +70,7 @@ class Pca(NamedTuple):
         return float(self.variances.sum() / self.total)
 
     def apply(self, descriptors: Descriptors) -> Float32[np.ndarray, "n dim"]:
-        """Reduce descriptors to their components, a few thousand rows at a time.
+        """Reduce descriptors to their components, in float32, some rows at a time.
 
         Raises:
             InputError: descriptors that are not a matrix, are not finite, or have another length
@@ -94,10 +94,10 @@ class Pca(NamedTuple):
         return np.sqrt(self.variances) if self.config.whiten else np.ones((), np.float32)
 
     def projection(self) -> "tuple[Linear, ProjectionConfig]":
-        """Return the components as the last layer of a model.
+        """Convert the components to a linear layer for the end of a model.
 
         Returns:
-            Parameters in float32, and configuration, of `Crisalad.projection`.
+            The layer's parameters, in float32, and configuration, for `Crisalad.projection`.
         """
         # Imported here: applying components needs no JAX.
         import jax.numpy as jnp
@@ -113,16 +113,16 @@ class Pca(NamedTuple):
 def shortened(
     pca: Pca | None, describer: "Describer", name: str, *, unit: bool = False
 ) -> tuple[int, bool]:
-    """Check that components fit a model, and return what its descriptors become.
+    """Check that components fit a model, and return the length of the reduced descriptors.
 
     Args:
         pca: the components; None leaves descriptors as they are.
         describer: the model.
-        name: name for messages: of the model, or of what needs the descriptors.
-        unit: whether the descriptors must be unit vectors.
+        name: what to name in error messages: the model, or what needs its descriptors.
+        unit: whether the resulting descriptors must be unit vectors.
 
     Returns:
-        The length of the descriptors, and whether they are unit vectors.
+        The length of the resulting descriptors, and whether they are unit vectors.
 
     Raises:
         InputError: the components were fitted to other descriptors, or unit vectors are required
@@ -161,19 +161,19 @@ def fit_pca(
     name: str = "descriptors",
     quiet: bool = True,
 ) -> Pca:
-    """Fit `dim` principal components, in memory that depends only on d.
+    """Fit `dim` principal components to descriptors of length d, in memory that depends only on d.
 
     The d x d covariance is summed in float64, some rows at a time, and its leading eigenvectors are
-    computed. If there are fewer descriptors than d, their n x n Gram matrix gives the same
-    components. Fitted descriptors are read twice, first for the mean.
+    computed. If at most d descriptors are fitted, their Gram matrix, which is smaller, gives the
+    same components. The fitted descriptors are read twice, the first time for the mean.
 
     Args:
-        descriptors: n x d, as for `search`, of any norm.
+        descriptors: (n, d), in memory or as a memory map, of any norm.
         dim: number of components.
-        config: whether to whiten, and whether to normalise.
-        samples: fit at most this many descriptors, drawn at random; None for all.
+        config: whether to whiten and to renormalise; None is the default `PcaConfig`.
+        samples: maximum number of descriptors to fit, drawn at random; None fits all.
         seed: random seed of the draw.
-        model: `model_hash` of the model that made the descriptors; others cannot use the result.
+        model: `model_hash` of the only model that may use the components; empty allows any.
         name: name of the descriptors in messages, such as their file.
         quiet: whether to hide the progress bar.
 
@@ -243,17 +243,17 @@ class Plane(NamedTuple):
 def project_to_plane(descriptors: Descriptors) -> Plane:
     """Project descriptors onto the plane in which they vary most, to plot them.
 
-    The plane is that of the first two principal components. Distances in it are at most those
-    between the descriptors.
+    It is the plane of the first two principal components. Distances in it are never larger than
+    those between the descriptors.
 
     Args:
-        descriptors: n descriptors, as `search` takes them.
+        descriptors: n descriptors of any norm.
 
     Returns:
         Positions relative to the mean, and the share of the variance along each axis.
 
     Raises:
-        InputError: what `fit_pca` raises; it needs three descriptors that are not on a line.
+        InputError: fewer than three descriptors, or all on a line; or an array `fit_pca` refuses.
 
     Example:
         >>> import numpy as np
@@ -292,7 +292,7 @@ def _leading(
 
 
 def pca_hash(pca: Pca) -> str:
-    """Compute a digest of components: of their values, and of how they are applied."""
+    """Compute the SHA-256 of components: of their arrays and `PcaConfig`, but not `Pca.model`."""
     digest = hashlib.sha256(json.dumps(to_plain(pca.config), sort_keys=True).encode())
     for name in _ARRAYS:
         digest.update(np.ascontiguousarray(getattr(pca, name)).data)

@@ -1,6 +1,6 @@
 """Exact search for the most similar descriptors.
 
-This is the public protocol of visual place recognition: exact nearest neighbours.
+Published evaluations of visual place recognition use exact nearest neighbours.
 """
 
 import functools
@@ -47,11 +47,11 @@ def search(
     The database may be a memory map that is larger than memory. It is read once, `chunk` rows at a
     time and one chunk ahead; the best rows are then read again. Apart from the inputs, memory holds
     three chunks and their similarities to 1,024 queries. Pages of a memory map are released after
-    use. If queries have many near copies in the database, it is read a second time.
+    use. If queries have many near copies in the database, all of it is read a second time.
 
-    Float32 products select candidates; NumPy computes them on a CPU, the devices otherwise. The
-    final similarity of a candidate is summed in float64 and rounded to float32, so its bits depend
-    on neither chunk nor devices. Equal similarities are ordered by database index, lower first.
+    Float32 products select candidates; NumPy computes these products on a CPU, and JAX on other
+    devices. The similarities of candidates are then summed in float64 and rounded to float32, so
+    they depend on neither chunk nor devices. Equal similarities are ordered by database index.
 
     Packed bits are compared by Hamming distance, in NumPy. Their similarity is 1 - 2 h / d, where
     h of the d bits differ: the cosine of the sign vectors.
@@ -61,7 +61,7 @@ def search(
             a .npy file stores as two untyped bytes, "V2"), or in another type that is converted to
             float32; or bits from `pack_bits`.
         queries: unit descriptors of the q queries, or their bits.
-        k: neighbours per query, or all n if fewer.
+        k: number of neighbours per query; all n if there are fewer.
         chunk: database rows compared at a time, rounded up to a multiple of the device count.
         quiet: whether to hide the progress bar.
 
@@ -108,9 +108,9 @@ def search(
 def to_unit_vectors(
     database: Descriptors, queries: Float[np.ndarray, "q d"]
 ) -> tuple[Float32[np.ndarray, "n d+3"], Float32[np.ndarray, "q d+3"]]:
-    r"""Embed descriptors so that their cosines rank them as the Euclidean distances do.
+    r"""Embed descriptors so that their cosines rank the database as the Euclidean distances do.
 
-    After both sides are divided by the largest norm, x of the database and y of the queries become
+    After division by the largest norm of all, x of the database and y of the queries become
 
     $$\left(\sqrt{\tfrac23}\,x,\ \tfrac{|x|^2}{\sqrt3},\ a,\ 0\right) \quad\text{and}\quad
     \left(\sqrt{\tfrac23}\,y,\ -\tfrac{1}{\sqrt3},\ 0,\ b\right),$$
@@ -122,7 +122,7 @@ def to_unit_vectors(
         queries: descriptors of the q queries, of any norms.
 
     Returns:
-        Unit vectors of both sides, with three more dimensions.
+        Unit vectors of the database and of the queries, with three more dimensions, in float32.
 
     Raises:
         InputError: a side is not a matrix, or is empty; the sides' widths differ; a value is not

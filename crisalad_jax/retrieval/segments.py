@@ -1,11 +1,11 @@
 """Append rows to a folder, segment by segment, so that `extract` and `index` can resume.
 
-The rows of a segment go to a store. Then its record, JSON with a checksum, is renamed to its final
-name: that single rename commits the segment. A process killed at any moment leaves the rows as they
-were before the segment or after it.
+The rows of a segment go to a store. Then the segment's record, JSON with a checksum, is renamed to
+its final name: that single rename commits the segment. A process that is killed at any moment
+leaves a segment either complete or without effect.
 
-A change commits any number of segments with a single record. The names of the segments' records
-say which change they wait for.
+A change commits any number of segments with a single record of its own. Until then, the names of
+the segments' records say which change they wait for.
 """
 
 import collections
@@ -25,20 +25,20 @@ from crisalad_jax.utils.files import atomic_path, read_json
 from crisalad_jax.utils.shapes import Int64
 
 SEGMENT = 256
-"""Number of images appended together: at most this many are described again after a kill."""
+"""Number of images appended together, and so the most to be described again after a kill."""
 
 
 Take = Callable[[Mapping[str, Any], pathlib.Path], None]
-"""Takes a record and its file."""
+"""A function that is called with a record and the path of its file."""
 
 
 class Segment(NamedTuple):
-    """Consecutive rows that were appended together."""
+    """`count` consecutive rows, from row `first` on, that were appended together."""
 
     first: int
     count: int
     sha256: str
-    """Digest of the rows' bytes."""
+    """Hexadecimal SHA-256 of the bytes of the rows."""
 
 
 def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | None = None) -> None:
@@ -64,8 +64,8 @@ class Segments:
             store: store of the rows.
             dtype: type of the rows.
             take: called with each record and its file in order, now and when one is appended.
-                Records of segments have the `names` of their rows, those of changes the number of
-                `rows` after the change. By default, records are appended to `records`.
+                The record of a segment has the `names` of its rows, that of a change the number of
+                `rows` after it. None appends the records to the attribute `records`.
 
         Raises:
             InputError: a record or its rows are damaged or missing.
@@ -75,9 +75,9 @@ class Segments:
         self.records: list[Mapping[str, Any]] = []
         self._give: Take = take or (lambda record, _: self.records.append(record))
         self.paths: list[pathlib.Path] = []
-        """The files of the records of the segments."""
+        """Paths of the segments' record files, in order."""
         self.changes = 0
-        """Number of changes."""
+        """Number of committed changes."""
         # A writer adds records in order, so all records before the listed ones exist. It may add
         # more while they are read. The segments of a change exist before its record.
         later = set(folder.glob("change-*.json"))
@@ -121,7 +121,7 @@ class Segments:
         return self.folder / f"change-{number:010d}.json"
 
     def waiting(self) -> list[pathlib.Path]:
-        """List the records of segments whose change does not exist yet, in order."""
+        """List the record files of segments whose change is not committed yet, in order."""
         numbered = ((path, path.stem.partition(".")[2]) for path in self.folder.glob("[0-9]*.json"))
         count = self.changes
         return sorted(path for path, of in numbered if of.isdecimal() and int(of) >= count)
@@ -139,7 +139,7 @@ class Segments:
         self.paths.append(path)
 
     def append(self, record: Mapping[str, Any], rows: Descriptors) -> None:
-        """Append a segment: it is committed once this returns, and not at all before.
+        """Append a segment, which is committed once this call returns, and has no effect before.
 
         Args:
             record: JSON values, including `names`, one for each row.
@@ -167,7 +167,7 @@ class Segments:
 
         Args:
             record: JSON values of the change, which `parts` may add to while it yields.
-            parts: record and rows of each segment, as in `append`.
+            parts: (record, rows) of each segment, as in `append`.
 
         Raises:
             InputError: the store or the folder cannot be written to.
@@ -193,7 +193,7 @@ class Segments:
             self._give(*each)
 
     def remove_waiting(self) -> int:
-        """Remove the segments whose change does not exist; return how many there were."""
+        """Remove the segments whose change was never committed, and return their number."""
         waiting = self.waiting()
         for record in reversed(waiting):  # so a kill leaves only rows without a record
             record.unlink()
@@ -239,7 +239,7 @@ def _sha256(rows: np.ndarray, dtype: np.dtype) -> str:
 
 
 def digest_of(names: Sequence[str], settings: Mapping[str, Any]) -> str:
-    """Compute a digest of everything that the rows of a collection depend on."""
+    """Compute the SHA-256 of image names and settings, on which a folder's rows depend."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for name in names:
         digest.update(f"{name}\n".encode(errors="surrogateescape"))

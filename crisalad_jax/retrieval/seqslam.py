@@ -1,4 +1,4 @@
-"""SeqSLAM: lines through the differences between the last frames and the images of a map.
+"""SeqSLAM: locate a camera by a line of low differences between frames and a map's images.
 
 Milford and Wyeth, ICRA 2012.
 """
@@ -16,14 +16,14 @@ from crisalad_jax.utils.shapes import Float, Float64
 
 @brief
 class SeqSlamState(NamedTuple):
-    """What the search knows after some frames."""
+    """The state of a SeqSLAM search after some frames."""
 
     belief: PerPlace
-    """Softmax share of each image of the map; see `SeqSlam`."""
+    """Belief that the camera is at each image of the map; sums to 1. See `SeqSlam`."""
     common: PerPlace
     """Similarity of each image to the mean descriptor of the map; not used."""
     rows: Float64[np.ndarray, "frame place"]
-    """Enhanced differences of the last frames to all images."""
+    """Enhanced differences between the last frames, oldest first, and all images."""
     frames: int
     """Number of frames so far."""
 
@@ -33,18 +33,18 @@ class SeqSlam:
     """SeqSLAM (Milford and Wyeth, ICRA 2012), for consecutive frames of one camera.
 
     The difference between a frame and an image, one minus their similarity, is enhanced: the mean
-    over the surrounding images is subtracted, and the result is divided by their deviation. The
-    score of an image is the smallest sum of enhanced differences along a line that ends at it in
-    the last frame. Lines have velocities from `slowest` to `fastest` in steps of 0.1 images of the
-    map per frame, and are rounded to the nearest image; they stop at the first image. The belief in
-    an image is the softmax of its negative score, which the paper does not have. The paper also
-    compares not by cosine, but by sums of absolute differences of small, patch-normalised images
-    (the model `thumbnail`).
+    over the surrounding images is subtracted, and the result divided by their standard deviation.
+    The score of an image is the smallest sum of enhanced differences along a line that ends at this
+    image in the latest frame. Lines have velocities from `slowest` to `fastest` in steps of 0.1
+    images of the map per frame, and are rounded to the nearest image; before the first image, they
+    stay at it. The belief in an image is the softmax of its negative score, which is not in the
+    paper. The paper also compares images not by cosine, but by sums of absolute differences of
+    small, patch-normalised images (the model `thumbnail`).
 
     Args:
-        length: number of last frames that a line goes through.
+        length: number of latest frames that a line goes through.
         window: number of surrounding images, half on either side, for enhancing differences.
-        slowest: lowest velocity.
+        slowest: lowest velocity, in images of the map per frame.
         fastest: highest velocity.
 
     Raises:
@@ -81,31 +81,31 @@ class SeqSlam:
         return np.linspace(self.slowest, self.fastest, steps + 1).round(9)
 
     def start(self, common: PerPlace) -> SeqSlamState:
-        """Begin a sequence anywhere in a map.
+        """Start a sequence, with the same belief in all images of a map.
 
         Args:
             common: a value for each image; only their number is used.
 
         Raises:
-            InputError: no places, or a value that is not finite.
+            InputError: no images, or a value that is not finite.
         """
         common = checked("common", common, (max(1, np.size(common)),))
         count = len(common)
         return SeqSlamState(np.full(count, 1 / count), common, np.empty((0, count)), 0)
 
     def step(self, state: SeqSlamState, similarities: PerPlace, moved: float = 1.0) -> SeqSlamState:
-        """Take the next frame into account.
+        """Update the state with the next frame.
 
         Args:
             state: state after the previous frame.
             similarities: cosine similarities of the frame to every image of the map.
-            moved: not used, since lines count frames.
+            moved: not used, since velocities are per frame.
 
         Returns:
             The state after this frame.
 
         Raises:
-            InputError: similarities that are not one finite number per place.
+            InputError: similarities that are not one finite number per image.
         """
         differences = 1 - checked("similarities", similarities, state.common.shape)
         enhanced = self.enhance(differences)[None]
@@ -119,7 +119,7 @@ class SeqSlam:
         return SeqSlamState(belief / belief.sum(), state.common, rows, state.frames + 1)
 
     def enhance(self, differences: PerPlace) -> Float[np.ndarray, " place"]:
-        """Enhance the contrast of a frame's differences locally; windows are cut at the ends."""
+        """Enhance a frame's differences locally; windows are cut at both ends of the map."""
         side, count = self.window // 2, len(differences)
         first = (np.arange(count) - side).clip(0)
         end = (np.arange(count) + side + 1).clip(max=count)

@@ -27,14 +27,14 @@ _ROUNDING = 5e-4
 
 @brief
 class SequenceState(NamedTuple):
-    """What a filter knows after some frames."""
+    """The state of a filter after some frames."""
 
     belief: PerPlace
     """Probability that the camera is at each image of the map."""
     common: PerPlace
     """Similarity of each image to the mean descriptor of the map."""
     seen: PerPlace
-    """Sum of the similarities of the frames so far to each image."""
+    """Sum, over the frames so far, of their similarities to each image."""
     frames: int
     """Number of frames so far."""
     along: PerPlace
@@ -53,8 +53,8 @@ class BayesFilter:
     z is its similarity to the frame in standard deviations from the mean over the map, so it does
     not depend on how close together the similarities of a model are.
 
-    If `adapt` is true, the mean of each side, the map or the frames so far, is subtracted from its
-    descriptors. That removes what all frames of a day have in common, such as its light (Schubert,
+    If `adapt` is true, the mean descriptor of each side (map, frames so far) is subtracted from its
+    descriptors. This removes what all frames of a day have in common, such as its light (Schubert,
     Neubert and Protzel 2020, "Unsupervised Learning Methods for Visual Place Recognition in
     Discretely and Continuously Changing Environments", ICRA). In the mean of the frames, the mean
     of the map counts as ten frames.
@@ -93,7 +93,7 @@ class BayesFilter:
         require_field(self, "sharpness", 0 < self.sharpness < np.inf, "above 0")
 
     def start(self, common: PerPlace, along: PerPlace | None = None) -> SequenceState:
-        """Begin a sequence anywhere in a map.
+        """Start a sequence, with the same belief in all images of a map.
 
         Args:
             common: similarity of each image to the mean descriptor of the map.
@@ -104,7 +104,7 @@ class BayesFilter:
             The state before the first frame.
 
         Raises:
-            InputError: no places, a similarity that is not finite, or an `along` that decreases or
+            InputError: no images, a similarity that is not finite, or an `along` that decreases or
                 has another length.
         """
         common = checked("common", common, (max(1, np.size(common)),))
@@ -115,11 +115,11 @@ class BayesFilter:
         return SequenceState(np.full(count, 1 / count), common, np.zeros(count), 0, along)
 
     def predict(self, state: SequenceState, moved: float = 1.0) -> PerPlace:
-        """Move a belief from one frame to the next, by the motion model.
+        """Predict the belief before the next frame, by the motion model.
 
         Args:
             state: state after the previous frame.
-            moved: as in `step`.
+            moved: seconds, metres or frames since the previous frame, as in `step`.
 
         Returns:
             The probability that the camera is at each image, before the next frame is seen.
@@ -137,7 +137,7 @@ class BayesFilter:
     def step(
         self, state: SequenceState, similarities: PerPlace, moved: float = 1.0
     ) -> SequenceState:
-        """Take the next frame into account.
+        """Update the state with the next frame.
 
         Args:
             state: state after the previous frame.
@@ -149,7 +149,7 @@ class BayesFilter:
             The state after this frame.
 
         Raises:
-            InputError: `moved` below 0, or similarities that are not one finite number per place.
+            InputError: `moved` below 0, or similarities that are not one finite number per image.
         """
         require(moved >= 0, f"moved: found {moved}, expected at least 0")
         row = checked("similarities", similarities, state.common.shape)
@@ -173,9 +173,9 @@ class BayesFilter:
 
         Args:
             similarities: similarities of every frame, in order, to every image of the map.
-            common: as in `start`.
-            along: as in `start`.
-            moved: motion before each frame, as in `step`; None is one frame each.
+            common: similarity of each image to the mean descriptor of the map.
+            along: how far along the map each image is, as in `start`.
+            moved: motion before each frame, as in `step`; None is 1 for each.
 
         Returns:
             The best place at each frame, given that frame and those before it.

@@ -1,4 +1,4 @@
-"""Procedural places made of planar polygons, drawn by a pinhole camera: a city and a world.
+"""Render procedural places, made of planar polygons, with a pinhole camera: a city and a world.
 
 Both are written in the layouts of real data sets: GSV-Cities (Ali-bey et al. 2022) for training,
 and VPR-datasets-downloader for evaluation. The modules in import order: `view` (how a picture is

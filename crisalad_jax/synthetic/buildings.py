@@ -1,4 +1,4 @@
-"""One building on the front of a street: walls, roof, windows, and shops or doors."""
+"""Add one building to the front of a street: walls, roof, windows, and shops or doors."""
 
 from typing import NamedTuple
 
@@ -29,14 +29,14 @@ _TRIMS = palette("88 87 84, 30 27 25, 70 66 58, 24 33 30")
 
 
 class Habit(NamedTuple):
-    """Properties that the buildings of one street share."""
+    """Properties shared by a street's buildings; `floors` counts those above the ground floor."""
 
     walls: tuple[Colour, ...]
     floors: int
     storey: float
     """Metres from floor to floor."""
     spacing: float
-    """Metres between the axes of windows."""
+    """Metres from the middle of one window to the middle of the next."""
 
 
 DEPTH = 11.0
@@ -44,7 +44,7 @@ DEPTH = 11.0
 
 
 def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> None:
-    """Add a building to a front, from u = 0 to `width`; axes as in `Mesh.front`."""
+    """Add a building to a front, from u = 0 to u = `width` metres (the axes of `Mesh.front`)."""
     wall, trim = pick(rng, habit.walls), pick(rng, _TRIMS)
     floors = max(1, habit.floors + int(rng.integers(-2, 3)))
     ground = rng.uniform(3.2, 4.8)

@@ -68,8 +68,8 @@ def write_synthetic_city(
 
     `root/train` has the GSV-Cities layout with two cities. `root/test` has that of
     VPR-datasets-downloader (`images/test/{database,queries}`). Places are 80 m apart and the images
-    of one within 10 m, so a radius of 25 m separates positives; no place is in both. The file
-    `root/set.json` stores the configuration; a root that already holds this city is not changed.
+    of one within 10 m, so a radius of 25 m separates positives; training and test places differ.
+    The configuration is in `root/set.json`; a root that already holds this city is not changed.
 
     Args:
         root: a folder that does not exist, or is empty, or holds this city.
@@ -77,7 +77,7 @@ def write_synthetic_city(
         quiet: whether to hide the progress bar.
 
     Returns:
-        Whether it was written; False if it was there already.
+        Whether the city was written; False if it existed already.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.

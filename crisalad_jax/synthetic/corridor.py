@@ -1,4 +1,4 @@
-"""One place indoors: a corridor, a hall or a room, with everything that stands or hangs in it."""
+"""Build one place indoors: a corridor, a hall or a room, with what stands or hangs in it."""
 
 from typing import NamedTuple
 
@@ -43,7 +43,7 @@ class _Box(NamedTuple):
 
 
 def corridor(rng: Rng) -> Place:
-    """Build a corridor; one in four is a wide hall with columns."""
+    """Build a random corridor; one in four is a wide hall with columns."""
     hall = rng.random() < 0.25
     width = rng.uniform(5.0, 16.0) if hall else rng.uniform(1.5, 4.2)
     height = rng.uniform(3.0, 8.0) if hall else rng.uniform(2.2, 3.4)
@@ -59,7 +59,7 @@ def corridor(rng: Rng) -> Place:
 
 
 def room(rng: Rng) -> Place:
-    """Build a room: a wide box, with objects along its end wall too, and furniture."""
+    """Build a random room: a wide box with furniture, and objects also along its end wall."""
     width, length = rng.uniform(3.5, 10.0), rng.uniform(7.0, 13.0)
     left = -width * rng.uniform(0.3, 0.7)
     box = _Box(left, left + width, rng.uniform(2.3, 4.2), length)

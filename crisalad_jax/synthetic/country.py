@@ -1,4 +1,4 @@
-"""One place in the country: a road, railway or path through fields, woods and hills."""
+"""Build one place in the country: a road, railway or path through fields, woods and hills."""
 
 from typing import Any
 
@@ -58,7 +58,7 @@ class _Way:
 
 
 def country(rng: Rng) -> Place:
-    """Build a place in the country."""
+    """Build a random place in the country, on a road, a railway, a path or a meadow."""
     mesh = Mesh()
     way = _Way(rng)
     kind = draw_kind(rng, road=0.4, railway=0.3, path=0.2, meadow=0.1)

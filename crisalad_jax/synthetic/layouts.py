@@ -1,6 +1,6 @@
-"""Rendered sets on disk: a folder that is written completely or not at all, and its layouts.
+"""Write rendered sets of images to disk, completely or not at all, in layouts of real data sets.
 
-A set is written from a stream of files, each a path within the set's folder and its bytes.
+A set is written from a stream of files, each a path within the set's folder and its content.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from crisalad_jax.utils.progress import progress_bar
 Files = Iterator[tuple[str, bytes]]
 
 RENDERER = 1
-"""Version of the renderer: increase it if pictures change; sets on disk then no longer match."""
+"""Version of the renderer. Increase it if pictures change: sets on disk then no longer match."""
 _FILE = "set.json"
 _METRES_PER_DEGREE = 111_195.0
 """Metres in a degree of latitude, on a sphere of radius 6371 km."""
@@ -36,16 +36,16 @@ _MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 
 
 
 def write_set(root: str | os.PathLike[str], config: Any, files: Files, *, quiet: bool) -> bool:
-    """Write a set into `root`, completely or not at all, unless it is there already.
+    """Write a set into `root`, completely or not at all, unless it exists there already.
 
     Args:
         root: a folder that does not exist, or is empty, or holds this set.
         config: the set's configuration, a dataclass; it is stored as set.json in the folder.
-        files: the files of the set.
+        files: (path within `root`, content) of each file of the set.
         quiet: whether to hide the progress bar.
 
     Returns:
-        Whether it was written; False if it was there already.
+        Whether the set was written; False if it existed already.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
@@ -81,24 +81,24 @@ class Shot(NamedTuple):
     view: View
     picture: bytes
     rng: Rng
-    """Draws the year and the panorama's name."""
+    """Random generator of the year and the panorama's name."""
     east: float = 0.0
-    """Metres from the set's south-west corner, like `north`."""
+    """Metres east of the set's south-west corner; `north` is the metres north of it."""
     north: float = 0.0
     northdeg: int = 0
-    """Heading of the camera in degrees from north."""
+    """Heading of the camera in degrees clockwise from north."""
 
     def draw_date(self) -> tuple[int, int]:
-        """Draw a year, and return it with the month of the season."""
+        """Draw a year, and return it with the month of the view's season, 1 to 12."""
         return int(self.rng.integers(2012, 2022)), _MONTHS[self.view.season]
 
     def draw_panoid(self) -> str:
-        """Draw the panorama's name."""
+        """Draw the panorama's name, 16 hexadecimal digits."""
         return self.rng.bytes(8).hex()
 
 
 def gsv_city(city: str, latitude: float, shots: Iterable[Shot]) -> Files:
-    """Lay out a city as GSV-Cities does: its images, and a table of them."""
+    """Yield the files of a city as GSV-Cities lays them out: images, and then their table."""
     per_degree = _METRES_PER_DEGREE * np.cos(np.deg2rad(latitude))
     rows = ["place_id,year,month,northdeg,city_id,lat,lon,panoid"]
     for shot in shots:
@@ -113,11 +113,11 @@ def gsv_city(city: str, latitude: float, shots: Iterable[Shot]) -> Files:
 
 
 def utm_images(shots: Iterable[Shot], scenery: str = "", *, camera: bool = False) -> Files:
-    """Lay out test images as VPR-datasets-downloader does: names with positions in metres.
+    """Yield test images as VPR-datasets-downloader lays them out: UTM metres are in their names.
 
     Args:
         shots: database images and queries, alternating.
-        scenery: name of the places in the file names.
+        scenery: kind of the places, for the file names; empty to leave it out.
         camera: whether names include the direction and height of the camera, and the date.
     """
     for side, shot in zip(itertools.cycle(("database", "queries")), shots, strict=False):
@@ -133,11 +133,11 @@ def utm_images(shots: Iterable[Shot], scenery: str = "", *, camera: bool = False
 
 
 def derive_seed(*numbers: int) -> int:
-    """Derive the seed of a place, for instance from a set's seed, a split and an index."""
+    """Derive a place's seed from some numbers, such as the set's seed, a split and an index."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
 
 
 def jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Compress a picture as a JPEG of quality 92."""
+    """Compress an RGB picture as a JPEG of quality 92."""
     _, data = cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 92))
     return data.tobytes()

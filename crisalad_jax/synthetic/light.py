@@ -1,4 +1,4 @@
-"""Light on surfaces: the colours of parts by hour, weather and season."""
+"""Compute light on surfaces: the colours of parts by hour, weather and season."""
 
 from typing import NamedTuple
 
@@ -10,14 +10,14 @@ from crisalad_jax.synthetic.view import SEASONS, Season, Time, View, Weather
 
 
 class Light(NamedTuple):
-    """The light on a place, and the colours of its sky, as arrays of red, green and blue."""
+    """The light on a place, and its sky's colours; arrays are red, green and blue, 0 to 1."""
 
     ambient: np.ndarray
     sun: np.ndarray
     zenith: np.ndarray
     horizon: np.ndarray
     elevation: float
-    """Degrees of the sun above the horizon."""
+    """Height of the sun above the horizon, in degrees."""
     lit: float
     """Brightness of lamps and windows, 0 to 1."""
     veil: np.ndarray = np.full(3, 0.22)
@@ -25,7 +25,7 @@ class Light(NamedTuple):
     visibility: float = 45.0
     """Metres over which contrast falls to 1/e."""
     to_sun: np.ndarray = np.zeros(3)
-    """Direction of the sun in the place."""
+    """Unit vector towards the sun in the place's axes: x right, y up, z along the street."""
 
 
 _OUTDOORS: dict[Time, Light] = {
@@ -75,11 +75,11 @@ GLOW: dict[int, tuple[float, Vector]] = {
     Kind.HEADLIGHT: (1.0, (1.0, 0.97, 0.86)),
     Kind.TAILLIGHT: (1.0, (0.95, 0.12, 0.08)),
 }
-"""Share of polygons that shine after dark and their colour, by kind."""
+"""Share of polygons that shine after dark, and the colour of their light, by kind."""
 
 
 def light_of(view: View, place: Place, rng: Rng) -> Light:
-    """Combine the light of the hour with the weather and the season's sun; indoors, use lamplight.
+    """Return the light of the hour, weather and season; indoors it depends only on the hour.
 
     The sun's direction is drawn at random: about south at noon, west at dusk.
     """
@@ -107,7 +107,7 @@ def light_of(view: View, place: Place, rng: Rng) -> Light:
 def part_colours(
     scene: Scene, depth: Float[np.ndarray, " part"], view: View, light: Light
 ) -> Float[np.ndarray, "part 3"]:
-    """Compute the colour of every part, 0 to 1: material, season, light and haze."""
+    """Compute each part's colour from material, season, light and haze at `depth` in metres."""
     albedo = scene.albedo.copy()
     leaf = np.isin(scene.kind, (Kind.LEAF, Kind.BUSH))
     first, second = _LEAVES[view.season]
@@ -137,7 +137,7 @@ def part_colours(
 def shining(
     scene: Scene, draw: Float[np.ndarray, " polygon"], lit: float
 ) -> Bool[np.ndarray, " polygon"]:
-    """Choose the polygons that shine: a random share of windows, all lamps, none by day."""
+    """Choose the polygons that shine: `draw` is below their `GLOW` share, scaled by `lit`."""
     gain = 0.35 + 0.65 * lit if lit else 0.0
     share = _by_kind(scene, {kind: share * gain for kind, (share, _) in GLOW.items()})
     return draw < np.repeat(share, scene.part_sizes)

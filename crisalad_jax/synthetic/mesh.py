@@ -1,4 +1,4 @@
-"""The geometry of a place, in metres: x to the right across the street, y up, z along it.
+"""The geometry of a place in metres: x to the right across the street, y up, z along the street.
 
 The camera of the default view stands at x = z = 0. A scene is a list of parts, painted from far to
 near.
@@ -18,11 +18,11 @@ Colour = np.ndarray
 """Red, green and blue, 0 to 1."""
 Vector = tuple[float, float, float]
 Paint = Colour | Vector
-"""A part's colour; for `Kind.LEAF` and `Kind.BUSH` its share of the second hue and its shade."""
+"""A part's colour; for LEAF and BUSH its share of the season's second hue, its shade, and 0."""
 Number = int | float | np.ndarray
 Polygons = Float[np.ndarray, "polygon corner 3"]
 Rect = tuple[Number, Number, Number, Number]
-"""The left, bottom, right and top edges of rectangles."""
+"""The left, bottom, right and top edges of rectangles, in metres."""
 Rng = np.random.Generator
 Lanes = tuple[float, float, float, float]
 """x of the left fronts, the left kerb, the right kerb and the right fronts of a street."""
@@ -30,7 +30,7 @@ Body = tuple[float, float, float, float, float]
 """A building's x0, x1, z0, z1 and height in metres, for its shadow."""
 
 GROUND_LAYER = 1e6
-"""Smallest layer of parts on the ground, which are painted below every shadow."""
+"""Smallest layer of parts on the ground, which are painted before every shadow."""
 UP: Vector = (0.0, 1.0, 0.0)
 DOWN: Vector = (0.0, -1.0, 0.0)
 TO_CAMERA: Vector = (0.0, 0.0, -1.0)
@@ -74,7 +74,7 @@ def pick(rng: Rng, colours: tuple[Colour, ...], spread: float = 0.06) -> Colour:
 
 
 def polygons(*corners: tuple[Number, Number, Number]) -> Polygons:
-    """Make a polygon from each element of the coordinates, which are broadcast to one shape."""
+    """Make one polygon for each element of the corners' coordinates, broadcast to one shape."""
     numbers = [number for corner in corners for number in corner]
     table = np.empty((*np.broadcast(*numbers).shape, len(numbers)))
     for column, number in enumerate(numbers):
@@ -99,7 +99,7 @@ def bars(
 
 
 def triangles(x0: Number, x1: Number, y: Number, tip_x: Number, tip_y: Number) -> Polygons:
-    """Make upright triangles over level edges."""
+    """Make upright triangles over level edges, at z = 0."""
     return polygons((x0, y, 0), (x1, y, 0), (tip_x, tip_y, 0))
 
 
@@ -116,13 +116,13 @@ def sheets(
 
 
 def discs(x: Number, y: Number, radius: Number, z: float = 0.0) -> Polygons:
-    """Make round polygons that face the camera."""
+    """Make discs that face the camera, as polygons of ten corners."""
     angles = np.arange(10) * (2 * np.pi / 10)
     return polygons(*((x + radius * np.cos(a), y + radius * np.sin(a), z) for a in angles))
 
 
 class Scene(NamedTuple):
-    """Parts as arrays: points in metres, polygons as runs of points, parts as runs of polygons."""
+    """Parts as arrays: polygons are runs of points (in metres), parts are runs of polygons."""
 
     points: Float[np.ndarray, "point 3"]
     polygon_sizes: Int[np.ndarray, " polygon"]
@@ -135,7 +135,7 @@ class Scene(NamedTuple):
 
 
 class Mesh:
-    """A scene under construction; its parts are polygons of one colour, normal and layer."""
+    """A scene under construction; a part is a set of polygons of one colour, normal and layer."""
 
     def __init__(self, eye: float = EYE) -> None:
         """Start without parts; cameras are about `eye` metres above the ground."""
@@ -155,17 +155,17 @@ class Mesh:
         self._parts: list[tuple[np.ndarray, Paint, Vector, int, float]] = []
 
     def at(self, x: float, z: float, layer: float | None = None) -> "Mesh":
-        """Return the same mesh with its origin at (x, z), in `layer` or that of distance z."""
+        """Return this mesh with its origin at (x, z), adding to `layer`; None is layer z."""
         here = copy.copy(self)
         here._origin = self.world(np.array((x, 0.0, z)))
         here.layer = float(z if layer is None else layer)
         return here
 
     def front(self, x: float, z: float, side: float, layer: float | None = None) -> "Mesh":
-        """Return the same mesh in the axes of a vertical plane, in the given layer.
+        """Return this mesh in the axes (u, v, d) of a vertical plane, such as a row of houses.
 
-        u runs along the plane, v up, d out of it. The plane stands at (x, z): along a side of the
-        street if `side` is -1 or 1, across the street if it is 0.
+        u runs along the plane, v up, d out of it. The origin is (x, z). The plane is along the left
+        or right side of the street if `side` is -1 or 1, and across the street if `side` is 0.
         """
         front = self.at(x, z, self.layer if layer is None else layer)
         along = np.array((0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0))
@@ -176,7 +176,7 @@ class Mesh:
         return front
 
     def world(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Convert points from the mesh's axes to the world's."""
+        """Convert points from this mesh's axes to the place's."""
         return points @ self._axes + self._origin
 
     def add(
@@ -187,18 +187,18 @@ class Mesh:
         normal: Vector | None = None,
         layer: float | None = None,
     ) -> None:
-        """Add a part, unless it has no polygons."""
+        """Add a part, unless it has no polygons; None takes this mesh's normal or layer."""
         if len(polygons):
             layer = self.layer if layer is None else layer
             part = self.world(polygons), albedo, normal or self.normal, int(kind), layer
             self._parts.append(part)
 
     def ground(self, polygons: Polygons, albedo: Paint, kind: Kind = Kind.SOLID) -> None:
-        """Add a part of the ground, on top of earlier ones."""
+        """Add a part of the ground, painted over earlier ones."""
         self.add(polygons, albedo, kind, UP, GROUND_LAYER + 1)
 
     def block(self, low: Vector, high: Vector, albedo: Paint) -> None:
-        """Add an upright box: its top, its side towards the middle of the street, its front."""
+        """Add an upright box: its top, its front, and its side towards the middle of the street."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         is_left = self._origin[0] + (x0 + x1) / 2 < 0
         x, outwards = (x1, 1.0) if is_left else (x0, -1.0)
@@ -217,7 +217,7 @@ class Mesh:
         self.add(rects(u0, v0, u1, v1, out), albedo, kind)
 
     def scene(self) -> Scene:
-        """Make a scene from all parts, of which there must be at least one."""
+        """Return the scene of all parts; there must be at least one."""
         parts, *materials = zip(*self._parts, strict=True)
         points = np.concatenate([part.reshape(-1, 3) for part in parts])
         counts = np.array([len(part) for part in parts])
@@ -231,15 +231,15 @@ class Reach(NamedTuple):
     height: tuple[float, float]
     """Minimum and maximum metres above the ground."""
     lateral: float
-    """Maximum metres to the side."""
+    """Maximum metres to either side."""
     forward: float
-    """Maximum metres along the place, from a station."""
+    """Maximum metres from a station along the place, in either direction."""
     step: float
     """Metres from one station to the next; stations are separate places that look similar."""
 
 
 class Place(NamedTuple):
-    """The scene of one place, and the orientation of its street."""
+    """The scene of one place, the orientation of its street, and what else a picture needs."""
 
     scene: Scene
     heading: float
@@ -249,15 +249,15 @@ class Place(NamedTuple):
     bearing: float = 0.0
     """Direction of the street in degrees clockwise from north."""
     hills: Float[np.ndarray, " bearing"] = np.zeros(96)
-    """Height of the hills over the horizon, as a tangent, at equal steps around the compass."""
+    """Tangent of the hills' elevation over the horizon, at equal steps clockwise from north."""
     bodies: Sequence[Body] = ()
     lamps: Float[np.ndarray, "lamp 3"] = np.zeros((0, 3))
     indoors: bool = False
     traffic: bool = True
-    """Whether vehicles pass; people do everywhere."""
+    """Whether there may be vehicles; there may be people everywhere."""
 
 
 def draw_hills(rng: np.random.Generator, most: float) -> Float[np.ndarray, " bearing"]:
-    """Draw the hills of a place, at most `most` high, as a tangent."""
+    """Draw the hills of a place, as tangents of their elevation, at most `most`."""
     ridge = rng.uniform(0.0, 1.0, 24) ** 2 * rng.uniform(0.02, most)
     return np.interp(np.arange(96), np.arange(24) * 4.0, ridge, period=96)

@@ -39,7 +39,7 @@ _BUILDERS = dict(zip(SCENERIES, (street, corridor, country, room, shapes), stric
 
 @functools.lru_cache(maxsize=32)
 def build_place(seed: int, scenery: Scenery = "street") -> Place:
-    """Build the place of a seed; the latest places are cached."""
+    """Build the place of a seed; the last 32 places are cached."""
     return _BUILDERS[scenery](np.random.default_rng((seed, 0)))
 
 
@@ -49,13 +49,13 @@ def render(
     image_size: tuple[int, int] = (126, 168),
     scenery: Scenery = "street",
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw one picture of a place, RGB. The same arguments give the same pixels.
+    """Render one RGB picture of a place; the same arguments give the same pixels.
 
     Args:
         place_seed: seed of the place, at least 0.
-        view: where the camera stands, and the season, light, weather and traffic it meets.
+        view: where the camera stands, and the season, light, weather and traffic.
         image_size: height and width in pixels.
-        scenery: kind of place.
+        scenery: kind of place, of `SCENERIES`.
 
     Raises:
         InputError: a negative seed, or a size out of range.

@@ -1,7 +1,7 @@
-"""One place made of meaningless boxes, poles and sheets, with patterns on them.
+"""Build one place of meaningless boxes, poles and sheets, with patterns on them.
 
-A model may learn to recognise streets and rooms by their windows and doors. Here all shapes, sizes
-and colours are random (after "dead leaves", Baradad et al. 2021, but in 3D).
+In streets and rooms, a model may learn to rely on windows and doors. Here all shapes, sizes and
+colours are random (after "dead leaves", Baradad et al. 2021, but in 3D).
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ from crisalad_jax.synthetic.things import tree
 
 
 def shapes(rng: Rng) -> Place:
-    """Build a place of shapes on a ground of patches."""
+    """Build a random place of shapes on a ground of patches."""
     mesh = Mesh()
     half = rng.uniform(2.0, 8.0)
     colours = [_colour(rng) for _ in range(int(rng.integers(3, 9)))]

@@ -1,4 +1,4 @@
-"""One place: a street with buildings, trees and lamps, all drawn from one seed."""
+"""Build one street with buildings, trees and lamps, all drawn from one seed."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ _ASPHALT = palette("30 30 31, 36 35 34, 42 38 35")
 
 
 def street(rng: Rng) -> Place:
-    """Build a street of a city."""
+    """Build a random street of a city."""
     mesh = Mesh()
     walls = tuple(WALLS[i] for i in rng.choice(len(WALLS), 5, replace=False))
     floors, storey = int(rng.integers(2, 6)), rng.uniform(2.9, 3.7)

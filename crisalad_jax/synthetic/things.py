@@ -1,4 +1,4 @@
-"""Objects and passers-by of a place: trees, lamps, wires, monuments, vehicles, people."""
+"""Build objects and passers-by: trees, lamps, wires, monuments, vehicles and people."""
 
 import functools
 
@@ -31,7 +31,7 @@ _TINTED = (0.10, 0.12, 0.14)
 
 
 def tree(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
-    """Add a broad-leaved tree, bare in winter, or an evergreen conifer."""
+    """Add a broad-leaved tree, bare in winter, or an evergreen conifer, at (x, z)."""
     mesh = mesh.at(x, z)
     height = rng.uniform(4.5, 8.5)
     bark = (0.26, 0.21, 0.17)
@@ -61,7 +61,7 @@ def tree(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
 
 
 def lamp(mesh: Mesh, x: float, z: float, height: float) -> None:
-    """Add a street lamp with an arm over the street."""
+    """Add a street lamp of this height in metres, with an arm over the street, at (x, z)."""
     mesh = mesh.at(x, z)
     tip = 1.3 if x < 0 else -1.3
     arm = bars(tip / 2, 0.65, height - 0.12, height)
@@ -71,7 +71,7 @@ def lamp(mesh: Mesh, x: float, z: float, height: float) -> None:
 
 
 def wires(mesh: Mesh, rng: Rng, x: float, length: float) -> None:
-    """Add a line of poles with sagging wires."""
+    """Add a line of poles with sagging wires at x, for `length` metres along the street."""
     height, gap = rng.uniform(7.0, 9.0), rng.uniform(14.0, 20.0)
     t = np.linspace(0, 1, 7)
     sag = height - 0.6 - 3.2 * t * (1 - t)
@@ -87,7 +87,7 @@ def wires(mesh: Mesh, rng: Rng, x: float, length: float) -> None:
 
 
 def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
-    """Add a column with a ball, or an obelisk, on a plinth in the street."""
+    """Add a column with a ball, or an obelisk, on a plinth in the street at (x, z)."""
     mesh = mesh.at(x, z)
     stone = pick(rng, WALLS[2:9])
     mesh.block((-1.5, 0.0, 0.0), (1.5, 0.9, 3.0), stone)
@@ -102,7 +102,7 @@ def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
 
 @functools.lru_cache(maxsize=8)
 def build_passers(seed: int, lanes: Lanes, traffic: bool, crowd: int = 0) -> Scene:
-    """Build cars along the kerbs, traffic in the lanes, people on the pavements, and a crowd.
+    """Build parked cars, moving traffic, people on the pavements, and `crowd` more people.
 
     Without traffic there are only people; one is far away, so that there is always somebody.
     """

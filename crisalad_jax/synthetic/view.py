@@ -1,4 +1,4 @@
-"""How a picture is taken: where the camera stands, what it meets there, and what it sees."""
+"""How a picture is taken: the camera's pose, its surroundings, and what it sees."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ SCENERIES: tuple[Scenery, ...] = get_args(Scenery)
 EYE = 2.4
 """Metres from the ground to the camera of the default view."""
 PITCH = 8.0
-"""Degrees by which the camera of the default view looks up."""
+"""Degrees by which the camera of the default view is tilted up."""
 NEAR = 0.4
-"""Metres from the camera to the near plane; nothing nearer is seen."""
+"""Metres from the camera to the near plane; nothing nearer is drawn."""
 Repaint = Annotated[float, limited(0, 3)]
 
 
@@ -39,24 +39,24 @@ class View:
     forward: float = 0.0
     """Metres along the street, towards its far end."""
     heading: float = 0.0
-    """Degrees clockwise from the direction in which the place is usually seen."""
+    """Degrees clockwise from the place's default direction, `Place.heading`."""
     height: float = EYE
     """Metres from the ground to the camera."""
     pitch: float = PITCH
-    """Degrees the camera looks up."""
+    """Degrees by which the camera is tilted up."""
     field: Annotated[float, limited(10, 150)] = 80.0
     """Horizontal field of view in degrees."""
     repaint: Repaint = 0.0
-    """Standard deviation of a change in each part's log colour: other paint, other light."""
+    """Standard deviation of a random change in the log colour of each part, as by other paint."""
     season: Season = "summer"
     time: Time = "noon"
     weather: Weather = "clear"
     occluders: int | None = None
     """Seed of the cars, buses and people in the street; None leaves it empty."""
     crowd: Annotated[int, limited(0)] = 0
-    """Extra people, if the street is not empty."""
+    """Number of additional people; ignored if `occluders` is None."""
     exposure: float = 0.0
-    """Exposure in stops."""
+    """Exposure in stops, relative to the default."""
     noise: Annotated[float, limited(0, 255)] = 0.0
     """Standard deviation of the sensor noise, in grey levels of 255."""
     seed: int = 0
@@ -71,14 +71,14 @@ def check_size(what: str, size: Sequence[int]) -> None:
     """Check the height and width of a picture in pixels.
 
     Raises:
-        InputError: one is out of range; the message names the argument `what`.
+        InputError: a side is not from 16 to 2048; the message names the argument `what`.
     """
     for side in size:
         require(16 <= side <= 2048, f"{what}: found {side}, expected 16 to 2048")
 
 
 class Camera:
-    """A pinhole camera in a place."""
+    """A pinhole camera in a place; its axes are right, up and ahead."""
 
     def __init__(self, heading: float, view: View, size: tuple[int, int]) -> None:
         """Place the camera, given the default view's heading in degrees and the size in pixels."""
@@ -94,15 +94,15 @@ class Camera:
         self._rotation = tilt @ turn
 
     def see(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Convert world metres to camera metres: right, up, ahead."""
+        """Convert points from the place's axes to the camera's (right, up, ahead), in metres."""
         return (points - self._position) @ self._rotation.T
 
     def project(self, seen: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Project camera metres in front of the near plane to pixels."""
+        """Project points in camera axes, beyond the near plane, to pixels (x, y)."""
         return self.centre + self.focal * seen[:, :2] * (1, -1) / seen[:, 2:]
 
     def outlines(self, seen: np.ndarray, sizes: np.ndarray) -> list[np.ndarray | None]:
-        """Project polygons (runs of points) to quarters of a pixel, or to None if out of sight."""
+        """Project polygons to outlines in quarters of a pixel, or to None if out of sight."""
         ends = np.cumsum(sizes)
         starts = ends - sizes
         x, y, depth = seen.T
@@ -123,7 +123,7 @@ class Camera:
 
 
 def clip_near(polygon: Float[np.ndarray, "corner 3"]) -> Float[np.ndarray, "kept 3"]:
-    """Cut a polygon in camera metres at the near plane (Sutherland-Hodgman)."""
+    """Clip a polygon, in camera axes, at the near plane (Sutherland-Hodgman)."""
     corners = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if a[2] >= NEAR:

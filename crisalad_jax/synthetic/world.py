@@ -1,4 +1,4 @@
-"""A world to train on: streets, corridors, rooms and more, in the layouts of real data sets."""
+"""Render a world to train on: streets, rooms and more, in the layouts of real data sets."""
 
 import dataclasses
 import os
@@ -31,9 +31,9 @@ from crisalad_jax.synthetic.view import (
 )
 
 Variation = Literal["stand", "season", "time", "weather", "traffic", "exposure"]
-"""What varies between the images of a place, in addition to paint; exposure includes the noise.
+"""What varies between images of a place, besides paint; "exposure" includes the sensor noise.
 
-The sun's position, clouds and white balance depend on a picture's seed, which always varies.
+The sun's position, clouds and white balance depend on `View.seed`, which always varies.
 """
 VARIATIONS: tuple[Variation, ...] = get_args(Variation)
 _FIELDS: dict[Variation, tuple[str, ...]] = {
@@ -52,22 +52,22 @@ class WorldConfig:
     """Size and seed of a world."""
 
     scenes: PositiveInt = 2400
-    """Training scenes, of each kind in turn."""
+    """Number of training scenes, divided among the kinds of `sceneries`."""
     stations: PositiveInt = 4
-    """Places of a scene, one behind another; they look similar."""
+    """Number of places per scene, one behind another; they look similar."""
     images_per_place: PositiveInt = 4
     test_scenes: PositiveInt = 100
-    """Other scenes, with two images of each station: a database image and a query."""
+    """Number of further scenes for testing, with a database image and a query of each place."""
     image_size: tuple[int, int] = (120, 160)
     """Height and width in pixels."""
     sceneries: tuple[Scenery, ...] = SCENERIES
     repaint: Repaint = 0.3
-    """Largest `View.repaint`."""
+    """Maximum of `View.repaint`, which is drawn for each image."""
     varied: tuple[Variation, ...] = VARIATIONS
-    """What varies between the training images of a place. Other fields are as in a plain `View`;
-    without "stand", all images share the scene's camera. Test images vary in all of these."""
+    """What varies between the training images of a place. Other fields have the defaults of `View`;
+    without "stand", all images share one camera of the scene. Test images vary in everything."""
     hard: Annotated[float, limited(0, 1)] = 0.3
-    """Share of the images taken from far to the side, turned, or through a crowd."""
+    """Share of hard images: from farther to the side, turned, and sometimes through a crowd."""
     seed: Seed = 0
 
     def __post_init__(self) -> None:
@@ -85,7 +85,7 @@ class WorldConfig:
 def write_world(root: str | os.PathLike[str], config: WorldConfig, *, quiet: bool = False) -> bool:
     """Render a world into `root`, completely or not at all.
 
-    `root/train` has the layout of GSV-Cities, each city with some scenes of one kind. `root/test`
+    `root/train` has the layout of GSV-Cities; a city is up to 12 scenes of one kind. `root/test`
     has that of VPR-datasets-downloader. Coordinates are placeholders: places are 100 m apart.
 
     Args:
@@ -94,7 +94,7 @@ def write_world(root: str | os.PathLike[str], config: WorldConfig, *, quiet: boo
         quiet: whether to hide the progress bar.
 
     Returns:
-        Whether it was written; False if it was there already.
+        Whether the world was written; False if it existed already.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
@@ -129,7 +129,7 @@ def _shots(
 
 
 def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: Rng) -> list[View]:
-    """Draw views of one station: a camera for the scene, and what changes from image to image."""
+    """Draw the views of a station's images: the scene's camera, and what varies between images."""
     reach = build_place(seed, scenery).reach
     camera = np.random.default_rng((seed, 6))
     plain = View(
@@ -150,7 +150,7 @@ def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: R
 
 
 def _harden(view: View, reach: Reach, rng: Rng) -> View:
-    """Move the camera far to the side and turn it, and add a crowd in a third of the views."""
+    """Move the camera far to the side and turn it, and add a crowd to a third of busy views."""
     return dataclasses.replace(
         view,
         lateral=rng.uniform(-2.2, 2.2) * reach.lateral,

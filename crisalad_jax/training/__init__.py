@@ -1,1 +1,1 @@
-"""Training: the compiled step, the optimiser, what is frozen, the loop and its files."""
+"""Training: the compiled step, the optimiser, frozen parameters, the loop and its files."""

@@ -25,7 +25,7 @@ def sets_of(places: TrainingSet) -> tuple[Places | QuerySet, ...]:
 
 
 def prepared_as(config: TrainConfig) -> dict[str, Any]:
-    """Return how a run's images are prepared, as arguments for `data.loader`."""
+    """Return how a run's images are prepared, as keyword arguments for `data.loader`."""
     return {
         "image_size": config.model.input_size,
         "preprocessing": config.model.preprocessing,
@@ -34,24 +34,24 @@ def prepared_as(config: TrainConfig) -> dict[str, Any]:
 
 
 class Drawn(NamedTuple):
-    """Batches of an epoch from a descriptor-based sampler; a run saves them with its state."""
+    """An epoch's batches, as image indices drawn by descriptors; a run saves them in its state."""
 
     step: Int32[np.ndarray, ""]
-    """First step of the epoch; -1 before the first."""
+    """First step of the epoch; -1 before the first epoch."""
     images: Int32[np.ndarray, "steps places images"]
 
 
 class PlaceBatches:
     """Batches of places from one set or a mixture, or from groups of classes in turn.
 
-    The images of a mixture are numbered consecutively over its sets, and a batch concatenates its
-    sub-batches.
+    The images of a mixture are numbered consecutively over its sets, and a batch concatenates one
+    sub-batch of each set.
     """
 
     def __init__(
         self, config: TrainConfig, places: Places | Mapping[str, Places], **reading: Any
     ) -> None:
-        """Divide the places into groups if the loss classifies, and count the steps.
+        """Divide the places into groups of classes if the loss classifies, and count the steps.
 
         Args:
             config: the run's configuration.
@@ -65,9 +65,9 @@ class PlaceBatches:
         self._runs = config.alone
         sets = (places,) if isinstance(places, Places) else [places[m.name] for m in config.mixture]
         self._turns = (JoinedPlaces(tuple(sets)),)
-        """What each epoch in turn trains on: all sets, or a group of classes."""
+        """What each epoch in turn trains on: all sets, or one group of classes."""
         self.classes: tuple[int, ...] = ()
-        """Number of classes of each group, if the loss classifies."""
+        """Number of classes of each group, if the loss classifies; otherwise empty."""
         grouping = config.loss.kind.grouping
         if grouping is not None:
             (places,) = sets
@@ -101,10 +101,10 @@ class PlaceBatches:
 
         Args:
             step: the first step of the epoch.
-            describe: describes images with the current model.
+            describe: function that describes image files with the current model.
 
         Returns:
-            A message to the user on what was done.
+            A message for the user, with the number of batches.
         """
         chosen = self._draw(step // self.steps_per_epoch, describe)
         self.mined = Drawn(np.array(step, np.int32), chosen.astype(np.int32))

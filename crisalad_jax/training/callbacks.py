@@ -23,7 +23,7 @@ Numbers = Mapping[str, int | float]
 
 
 class StopTraining(Exception):
-    """Raised by a callback to end a run, which is saved; the same call resumes it.
+    """Raised by a callback to end a run; the run is saved, and the same call of `fit` resumes it.
 
     Example:
         >>> class FirstStep(Callback):
@@ -33,7 +33,7 @@ class StopTraining(Exception):
 
 
 class Callback:
-    """A base class whose methods are called during a run; by default they do nothing.
+    """The base class of callbacks: methods are called during a run, and do nothing by default.
 
     When a killed run resumes, the steps and validations after its last saved state are repeated.
 
@@ -67,7 +67,7 @@ class Callback:
         """Handle a step, with the metrics of its line in metrics.jsonl: step, epoch, loss, ..."""
 
     def on_validation(self, numbers: Numbers) -> None:
-        """Handle a validation, with the metrics of its line: step, epoch, R@1, ..."""
+        """Handle a validation, with its metrics as in metrics.jsonl: step, epoch, R@1, ..."""
 
     def on_end(self, result: "FitResult") -> None:
         """Handle the end of a run; not called after an error or a signal."""
@@ -82,7 +82,7 @@ def register_callback(name: str) -> Callable[[_C], _C]:
     """Make a decorator that registers a callback class.
 
     Args:
-        name: the class's name for `--callback`.
+        name: name of the class for `--callback` and `make_callback`.
 
     Returns:
         The decorator, for a class that inherits from `Callback` and is made without arguments.
@@ -112,7 +112,7 @@ def make_callback(callback: Callback | str) -> Callback:
     """Return a callback unchanged, or make one from its name.
 
     Raises:
-        InputError: no such callback, or it needs a package that is not installed.
+        InputError: no callback has this name, or it needs a package that is not installed.
     """
     if isinstance(callback, Callback):
         return callback
@@ -135,7 +135,7 @@ class Callbacks:
         """Whether a callback has asked to stop."""
 
     def call(self, method: str, *arguments: Any) -> None:
-        """Call a method of each callback, in order."""
+        """Call a method of each callback, in order; `StopTraining` sets `stopped`."""
         for each in self._each:
             try:
                 getattr(each, method)(*arguments)
@@ -145,10 +145,10 @@ class Callbacks:
 
 @register_callback("csv")
 class CsvCallback(Callback):
-    """Tables `steps.csv` and `validations.csv` in the run's folder."""
+    """A callback that writes tables `steps.csv` and `validations.csv` in the run's folder."""
 
     def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
-        """Drop the lines that the resumed run will repeat."""
+        """Drop the lines that a resumed run will repeat."""
         self._out = out
         for name in ("steps", "validations"):
             path = self._path(name)
@@ -183,9 +183,9 @@ def _write_rows(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 @register_callback("wandb")
 class WandbCallback(Callback):
-    """A Weights & Biases run named after the folder, configured by WANDB_* environment variables.
+    """A callback that logs to Weights & Biases, configured by WANDB_* environment variables.
 
-    Resuming a run continues the same W&B run.
+    The W&B run is named after the run's folder. Resuming a run continues the same W&B run.
     """
 
     def __init__(self) -> None:
@@ -213,7 +213,7 @@ class WandbCallback(Callback):
 
 @register_callback("mlflow")
 class MlflowCallback(Callback):
-    """An MLflow run named after the folder, configured by MLFLOW_* environment variables."""
+    """A callback that logs to MLflow (set MLFLOW_* variables), in a run named after the folder."""
 
     def __init__(self) -> None:
         """Import the package."""

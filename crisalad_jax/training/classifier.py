@@ -1,4 +1,4 @@
-"""A loss's own parameters for each group of classes, which train with the model."""
+"""The parameters that belong to a loss, per group of classes; they train with the model."""
 
 import os
 from typing import NamedTuple
@@ -19,12 +19,12 @@ from crisalad_jax.utils.pytree import check_drawn
 
 
 class Classifiers(NamedTuple):
-    """Parameters of all groups, padded to the largest, so that one program trains each."""
+    """A loss's parameters for all groups, padded to the largest, so that one program trains any."""
 
     weights: PyTree
-    """Leaves have a leading axis of groups. Padding beyond a group's classes never changes."""
+    """Parameters, with a leading axis of groups. Padding beyond a group's classes never changes."""
     optimiser: PyTree
-    """Adam's state for each group; a group's moments do not change while others train."""
+    """Adam's state for each group; it does not change while other groups train."""
 
 
 def init_classifiers(
@@ -33,9 +33,9 @@ def init_classifiers(
     """Initialise a loss's parameters for each group; return None if it has none.
 
     Args:
-        key: random key.
+        key: random key; None suffices for a loss without parameters.
         loss: the loss.
-        classes: number of classes of each group; empty if there are no classes.
+        classes: number of classes of each group; empty if the loss does not classify.
         dim: width of a descriptor.
 
     Raises:
@@ -76,7 +76,7 @@ def _filled(leaf: Array, count: int, largest: int) -> Array:
 def update_classifiers(
     classifiers: Classifiers, group: Int[Array, ""], gradient: PyTree, learning_rate: float
 ) -> Classifiers:
-    """Take an Adam step (Kingma and Ba 2015) for one group; the others do not change."""
+    """Take an Adam step (Kingma and Ba 2015) for the group at an index; others do not change."""
     mine = jax.tree.map(lambda leaf: leaf[group], classifiers)
     updates, optimiser = optax.adam(learning_rate).update(gradient, mine.optimiser)
     stepped = Classifiers(optax.apply_updates(mine.weights, updates), optimiser)
@@ -87,18 +87,18 @@ def update_classifiers(
 def load_loss(path: str | os.PathLike[str]) -> tuple[LossConfig, PyTree]:
     """Read the loss of a run and its learnt parameters.
 
-    `load` reads the model from the same file. A run that starts from the file reinitialises its
-    loss. Class vectors, and a projection to a teacher's descriptor length, are stored only in a
-    run's `state/`.
+    `load` reads the model from the same file. A run that starts from this file reinitialises the
+    loss. Class vectors, and a projection to a teacher's descriptor length, are not in the file but
+    only in a run's `state/`.
 
     Args:
         path: the `last.safetensors` or `best.safetensors` of a run.
 
     Returns:
-        (configuration, parameters), as `metric_loss` takes them.
+        (configuration, parameters), for `metric_loss`.
 
     Raises:
-        InputError: what `load` raises; the file has no parameters of a loss; or the loss is not
+        InputError: `load` cannot read the file; it has no parameters of a loss; or the loss is not
             registered.
 
     Example:

@@ -35,7 +35,7 @@ from crisalad_jax.utils.errors import locate_errors
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class OptimiserConfig:
-    """An optimiser with an optional warm-up and a learning-rate schedule.
+    """An optimiser, its learning-rate schedule, and an optional warm-up.
 
     Example:
         >>> OptimiserConfig(kind="sgd", schedule="cosine", learning_rate=1e-3, warmup_steps=100)
@@ -54,16 +54,16 @@ class OptimiserConfig:
     warmup_epochs: NonNegativeInt = 0
     """Epochs of warm-up, instead of `warmup_steps`."""
     weight_decay: NonNegativeFloat = 0.01
-    """Weight decay; the default is torch's for AdamW, as the paper states no value. Optimisers
-    without weight decay add it to the gradient, as torch's Adam and SGD do."""
+    """Weight decay; the default is torch's for AdamW, as the paper states no value. With optimisers
+    that have none of their own, it is added to the gradient, as in torch's Adam and SGD."""
     clip_norm: PositiveFloat | None = None
-    """Maximum norm of the whole gradient."""
+    """Maximum norm of the whole gradient, which is scaled down if larger; None is no limit."""
     clip_value: PositiveFloat | None = None
-    """Maximum absolute value of a gradient element, after `clip_norm`."""
+    """Maximum absolute value of a gradient element, after `clip_norm`; None is no limit."""
     accumulate: PositiveInt = 1
     """Number of batches whose gradients are averaged for one optimiser step. `warmup_steps` counts
-    these steps. As in Lightning, the last batch of an epoch always steps; the sum of the remaining
-    gradients is divided by the same number."""
+    these steps. As in Lightning, the last batch of an epoch always takes a step; the sum of the
+    gradients left for it is divided by the same number."""
     ema: Fraction | None = None
     """Decay of an exponential moving average of the weights per optimiser step, such as 0.999;
     validation and saved weights use the average. None turns it off."""
@@ -90,11 +90,11 @@ class MiningConfig:
     """
 
     kind: Literal["none", "whole", "sample"] = "none"
-    """Database images that a round describes: "none", for training sets of places; the "whole"
-    database, from which each query draws candidates, in addition to its last negatives (NetVLAD);
+    """Database images that a round describes: "none", to train on places without mining; the
+    "whole" database, from which each query draws candidates and adds its last negatives (NetVLAD);
     or a "sample" of candidates for all queries of the round, and their positives (MSLS)."""
     negatives: PositiveInt = 10
-    """Negatives per tuple: the nearest candidates."""
+    """Number of negatives per tuple: the candidates nearest to the query by descriptor."""
     candidates: PositiveInt = 1000
     """Number of database images drawn as candidate negatives."""
     queries_per_round: PositiveInt = 1000
@@ -102,12 +102,12 @@ class MiningConfig:
     queries_per_epoch: PositiveInt | None = None
     """Queries per epoch, sampled for each round; None takes every query at most once."""
     positive_radius: float = 10.0
-    """Metres within which a database image is a query's positive."""
+    """Distance in metres within which a database image is a positive of a query."""
     negative_radius: float = 25.0
-    """Metres within which an image is not a negative."""
+    """Distance in metres within which a database image is not a negative of a query."""
     margin: PositiveFloat | None = None
-    """Use only negatives at most this much farther than the positive; None always takes the
-    hardest."""
+    """Use only negatives whose descriptor distance exceeds the positive's by less than this; None
+    always takes the hardest."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
@@ -129,7 +129,7 @@ class MixtureSet:
     """
 
     name: str
-    """Name of the set, used to pass its data and to log its loss: letters, digits and
+    """Name of the set, by which its data is passed and its loss is logged: letters, digits and
     underscores."""
     sampler: OrName[Sampler] = part_field(SAMPLERS, "within-city")
     """Which of its places make a sub-batch; a registered sampler, or its name."""
@@ -138,7 +138,7 @@ class MixtureSet:
     share: PositiveInt = 1
     """Share of the batch's places, relative to the other sets."""
     weight: PositiveFloat = 1.0
-    """Weight of its loss in the sum."""
+    """Weight of the set's loss in the sum of all losses."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
@@ -163,7 +163,7 @@ class TrainConfig:
     optimiser: OptimiserConfig = OptimiserConfig(
         schedule=LinearSchedule(end_fraction=0.2, decay_steps=4000)
     )
-    """By default the paper's AdamW, with a decay "as adopted in SALAD": by 80 % in 4,000 steps."""
+    """By default the paper's AdamW; rate decay "as adopted in SALAD", by 80 % in 4,000 steps."""
     trainable: str = ADAPTERS_AND_HEAD
     """What trains, comma-separated: adapters,head (the paper); last-N-blocks,norm,head (SALAD);
     all; or patterns of names, as in adapters,head,backbone.blocks.1[01]. A leading - freezes a word
@@ -184,7 +184,7 @@ class TrainConfig:
     XLA's loops have no fast convolutions. None is the whole batch. With "batch" statistics, batch
     norms use those of each micro-batch, as in several forward passes of torch."""
     min_images: int = 4
-    """Places, or classes, with fewer images are left out."""
+    """Minimum number of images of a place or class; those with fewer are left out."""
     mining: MiningConfig = MiningConfig()
     """Mining of tuples from a set of queries, instead of places. A batch is then `places_per_batch`
     tuples, each of `images_per_place` images: a query, a positive, and the negatives."""
@@ -195,19 +195,19 @@ class TrainConfig:
     of each, computes its loss separately, and adds the losses. Images attend only within their
     sub-batch. The first set determines the length of an epoch."""
     cities: tuple[str, ...] | None = None
-    """Cities to use; None is all."""
+    """Cities of the training set to use; None uses all."""
     epochs: PositiveInt = 8
     """Passes over the training set; a larger number extends an existing run. The paper converged
     within five, and stopped after three without gain."""
     validate_every: PositiveInt = 1
-    """Epochs from one validation to the next."""
+    """Number of epochs from one validation to the next."""
     validation_size: tuple[int, int] | None = None
     """Height and width that validations resize to; None is the model's. The saved model does not
     change."""
     monitor: Literal["R@1", "R@5", "R@1+R@5"] = "R@5"
     """Validation recall that selects the best weights."""
     patience: PositiveInt | None = 3
-    """Validations without a better recall before training stops; None never stops early."""
+    """Number of validations without a better recall after which training stops; None for never."""
     save_top_k: PositiveInt = 1
     """Number of validations whose weights are saved, by best recall."""
     seed: Seed = 0
@@ -295,7 +295,7 @@ class TrainConfig:
         return tuple(found) or (self,)
 
     def with_each(self, **changes: Callable[[Any], Any]) -> "TrainConfig":
-        """Apply functions to the sampler or loss of the run, or of each set of its mixture."""
+        """Apply functions, by field (sampler, loss), to the run or to each set of its mixture."""
 
         def changed(each: Any) -> Any:
             values = {name: change(getattr(each, name)) for name, change in changes.items()}
@@ -312,7 +312,7 @@ class TrainConfig:
 
     @property
     def min_images_of_place(self) -> int:
-        """Smallest number of images of a place; 1 if images are regrouped."""
+        """Minimum number of images of a place in the training set; 1 if images are regrouped."""
         grouping = self.loss.kind.grouping
         to_classes = grouping is not None and grouping.kind != "places"
         return 1 if to_classes or self.sampler.regroups else self.min_images

@@ -32,18 +32,18 @@ def join_processes(
 ) -> None:
     """Join a group of processes, before JAX is used for anything else.
 
-    On CPUs each process has one device: with several, threads that wait for other processes could
-    deadlock the group. On GPUs each process of a host also has one; see `local_device_ids`.
+    On CPUs, each process has one device: with several, threads that wait for other processes could
+    deadlock the group. With GPUs, each process of a host has one by default (`local_device_ids`).
 
     Args:
-        coordinator: HOST:PORT of process 0, reachable from all; or "auto" if JAX can query the
-            environment (Slurm, Open MPI, Kubernetes, Cloud TPU), also for `count` and `index`.
-        count: number of processes.
-        index: number of this process, from 0.
-        local_device_ids: numbers of this process's GPUs on its host. By default, the process's own
-            number on the host, if a launcher gives it (Slurm, Open MPI), if all processes are on
-            one host (a coordinator at localhost), or with "auto". Otherwise, or if the process sees
-            only one GPU, all that it sees.
+        coordinator: HOST:PORT of process 0, reachable from all; or "auto" if JAX can read
+            this, `count` and `index` from the environment (Slurm, Open MPI, Kubernetes, Cloud TPU).
+        count: number of processes; None with "auto".
+        index: number of this process, from 0; None with "auto".
+        local_device_ids: numbers of this process's GPUs on its host. None is the number of the
+            process on its host, if a launcher (Slurm, Open MPI) or "auto" gives it, or if all are
+            on one host (a coordinator at localhost). Otherwise, or if the process sees only one
+            GPU, it is all GPUs that the process sees.
 
     Raises:
         InputError: the arguments do not fit together, or other processes cannot be reached.
@@ -141,10 +141,10 @@ def is_primary() -> bool:
 
 
 def run_on_primary(work: Callable[[], _T]) -> _T:
-    """Run `work` only in the primary process; return its value, a JSON value, in every process.
+    """Run `work` only in the primary process; return its result, a JSON value, in every process.
 
     Raises:
-        InputError, Interrupted: in every process, as `raise_together` does.
+        InputError, Interrupted: in every process, if `work` raises, as `raise_together` does.
     """
     value: Any = raise_together(lambda: work() if is_primary() else None)
     if jax.process_count() == 1:
@@ -170,7 +170,7 @@ def check_same(numbers: Mapping[str, int]) -> None:
     """Check that all processes pass the same numbers, named for messages.
 
     Raises:
-        InputError: in every process, if they do not.
+        InputError: in every process, if a number differs between processes.
     """
     gathered = _gather(*numbers.values())
     is_other = gathered != gathered[0]
@@ -195,8 +195,8 @@ def raise_together(work: Callable[[], _T]) -> _T:
     """Run `work` in every process and return its value; raise in all if it fails in one.
 
     Raises:
-        Interrupted: a signal has ended it, here or in another process.
-        InputError: it failed in another process, which raises its own error.
+        Interrupted: a signal has ended `work`, here or in another process.
+        InputError: `work` has failed in another process, which raises its own error.
     """
     error, value, code = None, None, 0
     try:
@@ -216,5 +216,5 @@ def raise_together(work: Callable[[], _T]) -> _T:
 
 
 def failed_elsewhere(process: int) -> InputError:
-    """Make the error that the processes other than the failed one raise."""
+    """Make the error that all processes but the failed one raise."""
     return InputError(f"processes: process {process} failed; see what it says")

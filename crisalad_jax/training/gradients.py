@@ -1,4 +1,4 @@
-"""Norms of the gradient of a batch's loss, by part of the model."""
+"""Compute norms of the gradient of a batch's loss, for each part of the model."""
 
 import dataclasses
 import functools
@@ -41,11 +41,11 @@ def gradient_norms(
 ) -> dict[str, float]:
     """Compute the norm of the gradient of a batch's loss for each trainable part of the model.
 
-    The loss and the trainable parameters are those of the configuration. The squares of all norms
-    add up to the square of `Metrics.gradient_norm`.
+    The configuration says which loss, and which parameters train. The squares of all norms add up
+    to the square of the whole gradient's norm, `Metrics.gradient_norm`.
 
     Args:
-        params: the whole model.
+        params: the whole model's parameters.
         images: a batch, as `training_batches` yields it.
         labels: the place of each image.
         config: the run's configuration; `trainable="all"` shows all parts.
@@ -58,8 +58,8 @@ def gradient_norms(
         that do not train are left out.
 
     Raises:
-        InputError: what `init_train_state` and the step of `make_train_step` raise; or the loss
-            classifies, because only a run knows its classes.
+        InputError: nothing would train; no key for a loss with parameters; the step of
+            `make_train_step` refuses the batch; or the loss classifies: only a run has its classes.
 
     Example:
         >>> import jax, numpy as np

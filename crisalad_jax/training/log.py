@@ -1,4 +1,4 @@
-"""The log of a run: JSON lines for programs, TensorBoard's event files for people."""
+"""The log of a run: JSON lines for programs, and TensorBoard's event files for people."""
 
 import json
 import pathlib
@@ -15,9 +15,9 @@ class MetricsLog:
     """Metrics by step, as lines of `metrics.jsonl` and in `tensorboard/`."""
 
     def __init__(self, folder: pathlib.Path, *, keep_up_to: int, validated: int) -> None:
-        """Open the log of the run in `folder` and drop what a resumed run repeats.
+        """Open the log of the run in `folder`, and drop the lines that a resumed run repeats.
 
-        That is, all steps after `keep_up_to`, and validations after step `validated`.
+        These are the steps after step `keep_up_to`, and the validations after step `validated`.
 
         Raises:
             InputError: an existing log cannot be read.
@@ -48,9 +48,9 @@ class MetricsLog:
             self._add(keep_up_to + 1, session_log=begin)
 
     def write(self, values: Mapping[str, int | float], *, of: str = "") -> None:
-        """Append a line; `of` names the validation set for TensorBoard's tags.
+        """Append the metrics of a step, or of a validation on the set `of`.
 
-        The tags are those of other VPR tools: `loss`, `{set}/R5`.
+        TensorBoard's tags are those of other VPR tools: `loss`, or `{of}/R5` for R@5.
         """
         from tensorboardX.summary import scalar
 
@@ -63,7 +63,7 @@ class MetricsLog:
         self._events.flush()
 
     def close(self) -> None:
-        """Close TensorBoard's file."""
+        """Close TensorBoard's event file."""
         self._events.close()
 
     def _add(self, step: int, **what: Any) -> None:
@@ -74,7 +74,7 @@ class MetricsLog:
 
 
 def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
-    """Read the lines of a metrics file, except a last line that a kill cut off.
+    """Read the records of a metrics.jsonl, without a last line that a kill cut off.
 
     Raises:
         InputError: the file is missing, or a line is not a record of a step.

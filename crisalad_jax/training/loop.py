@@ -51,23 +51,23 @@ from crisalad_jax.utils.shapes import Float
 from crisalad_jax.utils.signals import SignalState, defer_signals, watch
 
 STATUS_STEPS = 5
-"""Number of steps of a round between exchanges of status among several processes."""
+"""Number of steps from one exchange of status among several processes to the next."""
 _T = TypeVar("_T")
 
 
 @brief
 class FitResult(NamedTuple):
-    """Result of a run."""
+    """The result of a training run."""
 
     params: Crisalad
-    """Parameters after the last step."""
+    """Parameters of the whole model after the last step."""
     steps: int
     best_recall: float | None
-    """Best validation recall, a fraction, by `TrainConfig.monitor`; None without validation."""
+    """Best validation recall by `TrainConfig.monitor`, as a fraction; None without validation."""
     stopped_early: bool
-    """Whether it ended before its last epoch, by `TrainConfig.patience` or by a callback."""
+    """Whether the run ended before its last epoch, by `TrainConfig.patience` or a callback."""
     skipped_images: int
-    """Number of unreadable images that were masked out, counted each time they came up."""
+    """Number of unreadable images that were masked out, counted once per batch they are in."""
 
 
 @ends_with_the_others
@@ -91,9 +91,9 @@ def fit(
 
     The files are: `config.json`; `metrics.jsonl`, a line for each step and each validation, and the
     same for TensorBoard in `tensorboard/`; `state/`, the checkpoint that a later call resumes from;
-    and `last.safetensors`, the weights, with the loss's learnt parameters (`load_loss`). A
-    validation adds `best.safetensors`, the weights of the best recall by `config.monitor` (grouping
-    `single`), and the best `config.save_top_k` weights in `best/`.
+    and `last.safetensors`, the weights, with the loss's learnt parameters (`load_loss`). With
+    `validation`, there are also `best.safetensors`, the weights with the best recall by
+    `config.monitor` (grouping `single`), and the best `config.save_top_k` weights in `best/`.
 
     A run in `out` with fewer epochs is extended; everything else in `config` must be the same. If
     the learning rate depends on the run's length, a warning says where it jumps.

@@ -1,8 +1,8 @@
 """End a process with a one-line error if another process of its run, or its host, is lost.
 
-JAX ends the others in one of two ways. An exchange raises an error, if the kernel of the lost
-process's host closes its connections; or JAX's service misses its heartbeats, and aborts each
-process in C++, at any point, with a page of messages.
+JAX ends the remaining processes in one of two ways. If the kernel of the lost process's host closes
+its connections, the next exchange of arrays raises an error. Otherwise JAX's coordination service
+misses its heartbeats, and aborts each process in C++, at any point, with a page of messages.
 """
 
 import atexit
@@ -45,9 +45,9 @@ _filters: list[subprocess.Popen[bytes]] = []
 
 
 def filter_aborts() -> None:
-    """Filter C++ output through a small program, which replaces JAX's page with one line.
+    """Filter C++ output through a small program that shortens JAX's abort messages to one line.
 
-    All C++ output goes to standard error; Python's output goes where it went before.
+    All C++ output then goes to standard error; Python's output goes where it went before.
     """
     program = subprocess.Popen(
         [sys.executable, "-ISc", _FILTER, _NEXT], stdin=subprocess.PIPE, start_new_session=True
@@ -64,10 +64,10 @@ def filter_aborts() -> None:
 
 
 def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Wrap a function that processes call together: if one is lost, the others raise.
+    """Wrap a function that all processes call together: if one is lost, the others raise.
 
-    The function's context managers exit first, so that a state being written is complete. This
-    process then exits without JAX's shutdown, which would wait for the lost one.
+    The function's context managers exit first, so that a state that is being written is completed.
+    This process later exits without JAX's shutdown, which would wait for the lost process.
 
     Raises:
         InputError: in place of JAX's error when an exchange with another process fails.

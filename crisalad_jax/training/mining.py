@@ -1,7 +1,7 @@
 """Mine tuples: a query, its nearest positive and its hardest negatives, by the current model.
 
-NetVLAD's cached hard mining (Arandjelovic et al., CVPR 2016), and the partial mining of Mapillary's
-code and of Berton et al. (CVPR 2022), which Patch-NetVLAD and SelaVPR train with.
+It is NetVLAD's cached hard mining (Arandjelovic et al., CVPR 2016), or the partial mining of
+Mapillary's code and Berton et al. (CVPR 2022), with which Patch-NetVLAD and SelaVPR train.
 """
 
 import math
@@ -21,15 +21,15 @@ from crisalad_jax.training.losses.pairs import Role, tuple_labels
 
 
 class Mined(NamedTuple):
-    """The tuples of a round, which a run saves with its state."""
+    """The tuples of a round (the part of an epoch that is mined at once), saved with the state."""
 
     step: Int32[np.ndarray, ""]
-    """First step of the round; -1 before the first."""
+    """First step of the round; -1 before the first round."""
     images: Int32[np.ndarray, "tuple image"]
     roles: Int32[np.ndarray, "tuple image"]
-    """See `losses.pairs.Role`."""
+    """`losses.pairs.Role` of each image; `images` holds indices in `QuerySet.files`."""
     hardest: Int32[np.ndarray, "query negative"]
-    """Last negatives of each query, which are candidates again; -1 for none."""
+    """Each query's previous hard negatives, which become candidates again; -1 for none."""
 
 
 class Miner:
@@ -74,11 +74,11 @@ class Miner:
         return step % self.steps_per_round == 0 and int(self.mined.step) != step
 
     def mine(self, step: int, describe: Describe) -> str:
-        """Mine a tuple for each query of the round that begins with a step.
+        """Mine a tuple for each query of the round that begins with `step`.
 
         Args:
             step: the first step of the round; with the seed, it determines the candidates drawn.
-            describe: describes images with the current model.
+            describe: computes the current model's descriptors of image files.
 
         Returns:
             A message to the user on how hard the tuples are.
@@ -174,7 +174,7 @@ class Miner:
 
 
 Batches = PlaceBatches | Miner
-"""The sources of a run's batches."""
+"""What yields a run's batches: of places, or of mined tuples."""
 
 
 def _distances(

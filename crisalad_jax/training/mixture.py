@@ -11,15 +11,15 @@ from crisalad_jax.training.losses import LossConfig
 def with_sets(config: TrainConfig, names: Sequence[str]) -> TrainConfig:
     """Adapt a configuration to the given training sets.
 
-    A mixture is reduced to these sets, each with as many places as before. Without a mixture, they
-    form one, each with the configuration's sampler and loss and the same number of places.
+    A mixture is reduced to these sets, each with as many places per batch as before. Without one,
+    the sets form a mixture: each has the configuration's sampler and loss, and equally many places.
 
     Args:
         config: the configuration of a recipe or an earlier run.
-        names: names of the sets; without any, the configuration stays as it is.
+        names: names of the sets; without names, the configuration is returned unchanged.
 
     Raises:
-        InputError: the mixture has no such set, or the configuration's loss is not one of pairs.
+        InputError: the mixture has no such set, or the loss does not compare pairs of images.
     """
     if not names:
         return config
@@ -47,10 +47,10 @@ def check_names(
     """Check the names of training sets.
 
     Args:
-        what: the argument that gives the names.
+        what: the argument that gives the names, for messages.
         names: names of the given sets.
         config: the run's configuration; without a mixture no set has a name.
-        least: smallest number of the mixture's sets; None is all.
+        least: minimum number of the mixture's sets; None requires all.
 
     Raises:
         InputError: a name is not in the mixture, or too few are given.

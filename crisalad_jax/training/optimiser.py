@@ -15,7 +15,7 @@ from crisalad_jax.training.schedules import RunSteps
 from crisalad_jax.utils.output import warn
 
 WARMUP_SHARE = 4
-"""Divisor of a run's steps: a warm-up takes at most a quarter, as in BoQ (10 of 40 epochs)."""
+"""Limit of a warm-up: a run's steps divided by this, as in BoQ (10 of 40 epochs)."""
 
 
 _Count = TypeVar("_Count", int, Array)
@@ -26,8 +26,8 @@ def count_steps(config: OptimiserConfig, batches: _Count, batches_per_epoch: int
 
     Args:
         config: the optimiser's configuration.
-        batches: number of batches, which is also the index of the next one.
-        batches_per_epoch: number of batches of an epoch, the last of which always steps.
+        batches: number of batches so far, which is also the index of the next one; may be traced.
+        batches_per_epoch: number of batches of an epoch, the last of which always ends a step.
 
     Example:
         >>> count_steps(OptimiserConfig(accumulate=4), 20, 10)
@@ -58,7 +58,7 @@ def warmup_length(config: OptimiserConfig, steps_per_epoch: int) -> int:
 def learning_rate_schedule(
     config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
 ) -> optax.Schedule:
-    """Make a linear warm-up, followed by `config.schedule`.
+    """Make the learning-rate function: a linear warm-up, followed by `config.schedule`.
 
     Args:
         config: the optimiser's configuration.
@@ -66,10 +66,10 @@ def learning_rate_schedule(
         steps_per_epoch: number of batches of an epoch.
 
     Returns:
-        A function of the number of steps that the optimiser has taken (`count_steps`).
+        A function of the number of steps that the optimiser has taken (see `count_steps`).
 
     Raises:
-        InputError: while tracing, for a schedule that does not return a number.
+        InputError: when the function is called, if `config.schedule` does not return a scalar.
     """
     peak = config.learning_rate
     warmup_steps = warmup_length(config, steps_per_epoch)
@@ -96,7 +96,7 @@ def learning_rate_schedule(
 
 
 def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> OptimiserConfig:
-    """Shorten a warm-up to the largest allowed share of a run.
+    """Shorten a warm-up to at most a quarter of a run's steps.
 
     Args:
         config: the optimiser's configuration.
@@ -104,7 +104,7 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
         steps_per_epoch: number of batches of an epoch.
 
     Returns:
-        The configuration, unchanged if the warm-up is short enough. A shortened one is in steps.
+        The configuration, unchanged if the warm-up is short enough; else with `warmup_steps` set.
 
     Example:
         >>> with_short_warmup(OptimiserConfig(warmup_epochs=5), 32, 4).warmup_steps
@@ -117,7 +117,7 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
 
 
 def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> None:
-    """Warn if a warm-up takes more than the largest allowed share of a run's steps."""
+    """Warn if a warm-up takes more than a quarter of a run of `steps` batches."""
     short = with_short_warmup(config, steps, steps_per_epoch)
     if short is config:
         return
@@ -136,8 +136,8 @@ def make_optimiser(
 ) -> optax.GradientTransformation:
     """Make the optimiser of a run, from `config.kind`.
 
-    With `config.clip_norm` or `config.clip_value` the gradient is clipped first (if several batches
-    share a step, their mean gradient). The average of `config.ema` comes last.
+    If `config.clip_norm` or `config.clip_value` is set, the gradient is clipped first; if a step
+    accumulates several batches, that is their mean. The weight average (`config.ema`) comes last.
 
     Args:
         config: the optimiser's configuration.
@@ -232,7 +232,7 @@ def _averaging(decay: float) -> optax.GradientTransformation:
 def averaged_weights(state: PyTree, weights: PyTree) -> PyTree:
     """Return the weights to validate and save: an average, if the optimiser has one.
 
-    It is that of `OptimiserConfig.ema`, or of schedule-free optimisers (Defazio et al. 2024).
+    The average is that of `OptimiserConfig.ema` or a schedule-free optimiser (Defazio et al. 2024).
 
     Args:
         state: the optimiser's state.

@@ -193,14 +193,14 @@ class _Moments(Optimiser):
     """Decays of the two moments of Adam."""
 
     b1: Fraction = 0.9
-    """Decay of the mean of the gradients."""
+    """Decay of the running mean of the gradients."""
     b2: Fraction = 0.999
-    """Decay of the mean of their squares."""
+    """Decay of the running mean of the squared gradients."""
 
 
 @OPTIMISERS.register("adamw")
 class AdamW(_Moments):
-    """AdamW (Loshchilov and Hutter 2019), as in torch: weights decay separately from the gradient.
+    """AdamW (Loshchilov and Hutter 2019), as in torch: weight decay is decoupled from the gradient.
 
     Example:
         >>> from crisalad_jax import OptimiserConfig
@@ -220,7 +220,7 @@ class Adam(_Moments):
     """Adam (Kingma and Ba 2015), as in torch: the weight decay is part of the gradient."""
 
     def make(self, learning_rate: Rate, weight_decay: float) -> Any:
-        """Return optax's Adam, after the weight decay."""
+        """Return optax's Adam, with the weight decay first added to the gradient."""
         import optax
 
         return _decayed(weight_decay, optax.adam(learning_rate, self.b1, self.b2))
@@ -231,10 +231,10 @@ class Sgd(Optimiser):
     """SGD with torch's momentum, without dampening; the weight decay is part of the gradient."""
 
     momentum: Fraction = 0.9
-    """Share of the previous direction to retain."""
+    """Share of the previous update's direction to retain."""
 
     def make(self, learning_rate: Rate, weight_decay: float) -> Any:
-        """Return optax's SGD, after the weight decay."""
+        """Return optax's SGD, with the weight decay first added to the gradient."""
         import optax
 
         return _decayed(weight_decay, optax.sgd(learning_rate, self.momentum))

@@ -36,7 +36,7 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
 
 SAVE_SECONDS = 300
-"""Longest time between saved states; validations and the end of a run save too."""
+"""Maximum seconds between saved states; validations and the end of a run save too."""
 
 DATA = "data.json"
 """File in which a run records its data (`write_data`)."""
@@ -47,7 +47,7 @@ class RunState(NamedTuple):
 
     training: TrainState
     mined: Mined | Drawn | None
-    """The batches of the current round; None if they do not depend on the model."""
+    """The images drawn for the current round; None if the draw does not depend on the model."""
 
 
 @dataclasses.dataclass
@@ -58,20 +58,20 @@ class RunRecord:
     """Checksums of the weights before the first step, of the names of all training images and their
     division into places, and of the validation benchmark (0 if there is none)."""
     sources: dict[str, list[Any]]
-    """Name and source digest of every part of the configuration."""
+    """[name, source digest] of every part, by the dotted name of its configuration field."""
     step: int = 0
     """Number of steps taken and logged."""
     validated: int = 0
     """Step of the last validation."""
     best: list[list[Any]] = dataclasses.field(default_factory=list)
-    """Recall, by `TrainConfig.monitor`, and step of the best validations, best first."""
+    """[recall, step] of the best validations, best first; the recall of `TrainConfig.monitor`."""
     without_gain: int = 0
     """Number of validations since the best one."""
     stopped_early: bool = False
     skipped_images: int = 0
 
     def add_validation(self, recall: float, config: TrainConfig) -> None:
-        """Record a validation of this step, and decide whether to stop early."""
+        """Record the recall of a validation at `step`, and decide whether to stop early."""
         newest = [recall, self.step]
         # Among equal recalls, the first counts as the best.
         best = sorted([*self.best, newest], key=lambda each: (-each[0], each[1]))
@@ -103,8 +103,8 @@ class RunFiles:
             The state to resume from, which `record` describes.
 
         Raises:
-            InputError: what `check_run` raises; another process is writing there; or the run had a
-                different start.
+            InputError: the folder holds anything but a run of this configuration; another process
+                is writing to it; or its run started from other weights, data or code.
         """
 
         def load() -> dict[str, Any]:
@@ -145,7 +145,7 @@ class RunFiles:
         return state
 
     def log(self, values: Mapping[str, int | float], *, of: str = "") -> None:
-        """Append a line to the log; see `MetricsLog.write`."""
+        """Append a line to the log, in the primary process; `of` is a validation's benchmark."""
         if distributed.is_primary():
             with wrap_os_errors(self.out):
                 self._log.write(values, of=of)
@@ -172,7 +172,7 @@ class RunFiles:
         save_weights(path, Model(params, self._config.model), loss=saved)
 
     def save_is_due(self) -> bool:
-        """Return whether the last saved state is old, by the primary process's clock."""
+        """Return whether the last save is over `SAVE_SECONDS` ago, in the primary process only."""
         return distributed.is_primary() and time.monotonic() - self._saved_at > SAVE_SECONDS
 
     def save(self, state: RunState, params: Callable[[], Crisalad]) -> None:
@@ -251,10 +251,10 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> bool:
     """Check that `out` is the folder of a run with this configuration, or can become one.
 
     Returns:
-        Whether there is a run of fewer epochs, which is then extended.
+        Whether `out` holds a run of fewer epochs, which the caller then extends.
 
     Raises:
-        InputError: it is a file, or holds a run of another configuration, or files but no run.
+        InputError: `out` is a file, or holds another configuration's run, other files, or links.
     """
     path = out / "config.json"
     if not path.exists():
@@ -299,7 +299,7 @@ def write_data(
 
 
 def checksum_of_places(places: TrainingSet) -> int:
-    """Compute the CRC of all images' names and places; in a `QuerySet`, also of its positives."""
+    """Compute the CRC-32 of all images' names and places, or of a `QuerySet`'s positives."""
     if isinstance(places, Mapping):
         return checksum(map(checksum_of_places, sets_of(places)))
     if isinstance(places, QuerySet):
@@ -309,10 +309,10 @@ def checksum_of_places(places: TrainingSet) -> int:
 
 
 def checksum_of_sizes(places: TrainingSet) -> int:
-    """Compute the CRC of the sizes of all image files.
+    """Compute the CRC-32 of the sizes of all image files.
 
     Raises:
-        InputError: an address cannot be reached.
+        InputError: the address of a remote image cannot be reached.
     """
     paths = (each.path(image) for each in sets_of(places) for image in range(len(each.files)))
     files = list(dict.fromkeys(map(file_of, paths)))
@@ -320,12 +320,12 @@ def checksum_of_sizes(places: TrainingSet) -> int:
 
 
 def checksum_of_config(config: TrainConfig) -> int:
-    """Compute the CRC of a configuration."""
+    """Compute the CRC-32 of a configuration."""
     return checksum([_text([json.dumps(to_plain(config))])])
 
 
 def checksum_of_benchmark(benchmark: Benchmark) -> int:
-    """Compute the CRC of the names of a benchmark and its images, whatever their folder."""
+    """Compute the CRC-32 of the names of a benchmark and its images, without their folders."""
     names = (path.name for path in (*benchmark.database, *benchmark.queries))
     return checksum([_text((benchmark.name, *names))])
 
@@ -335,7 +335,7 @@ def _text(names: Iterable[Any]) -> np.ndarray:
 
 
 def checksum(arrays: Iterable[Any]) -> int:
-    """Compute the CRC of all arrays, to detect differences."""
+    """Compute one CRC-32 of all arrays, to detect differences."""
     value = 0
     for each in arrays:
         value = zlib.crc32(np.asarray(each).tobytes(), value)

@@ -48,16 +48,16 @@ class Schedule(Part, abc.ABC):
     """
 
     spans_run: ClassVar[bool] = True
-    """Whether a longer run has other learning rates from the start."""
+    """Whether the learning rate of a step depends on the length of the run."""
 
     @abc.abstractmethod
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
-        """Return the learning rate of a step, a traced number.
+        """Return the learning rate of a step, a scalar, which may be traced.
 
         Args:
             step: number of optimiser steps after the warm-up, from 0; a traced float.
             learning_rate: the peak learning rate, at which the warm-up ends.
-            run: numbers of steps.
+            run: the run's numbers of optimiser steps.
         """
 
 
@@ -91,9 +91,9 @@ class _Decay(Schedule):
     """A decay to a share of the learning rate."""
 
     end_fraction: NonNegativeFloat = 0.0
-    """Share of the learning rate left at the end."""
+    """Share of the learning rate that is left after the decay."""
     decay_steps: PositiveInt | None = None
-    """Length of the decay, before a constant learning rate; None is the whole run."""
+    """Steps of the decay, after which the learning rate is constant; None is the whole run."""
 
     @property
     def spans_run(self) -> bool:
@@ -106,7 +106,7 @@ class LinearSchedule(_Decay):
     """Linear decay, step by step (SALAD's code, torch's `LinearLR`)."""
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
-        """Return the learning rate on the line."""
+        """Return the linearly decayed learning rate."""
         import optax  # only to train: a configuration does not need it
 
         end, length = learning_rate * self.end_fraction, self.decay_steps or run.after_warmup
@@ -118,7 +118,7 @@ class CosineSchedule(_Decay):
     """Cosine decay over half a period (Loshchilov and Hutter 2017, without restarts)."""
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
-        """Return the learning rate on the cosine."""
+        """Return the learning rate after the cosine decay so far."""
         import optax
 
         length = self.decay_steps or run.after_warmup
@@ -145,7 +145,7 @@ class StepSchedule(Schedule):
 
 @SCHEDULES.register("milestones")
 class MilestonesSchedule(Schedule):
-    """A step down after each of the given epochs, from the start; the defaults are MixVPR's.
+    """A step down after each of the given epochs of the run; the defaults are MixVPR's.
 
     A milestone before the end of the warm-up has no effect, as in GSV-Cities' code, where the
     warm-up overwrites the learning rate.

@@ -50,27 +50,27 @@ def read_inputs(
 ) -> RunInputs:
     """Read the training set, validation set and initial parameters; see `experiments.train`.
 
-    All processes call it together. Without `weights`, an aggregator's centroids are fitted to the
-    training images.
+    All processes call it together. Without `weights`, the centroids that an aggregator such as
+    NetVLAD starts from are fitted to the training images.
 
     Args:
         config: the run's configuration.
-        data: the training set, read or as a path, or the sets of `config.mixture` by name.
+        data: the training set or its path; for `config.mixture`, a path by the name of each set.
         out: folder of the run, which is checked first.
         images: folder of the images that a file of queries lists.
-        validation: evaluation set.
+        validation: path of the validation set; None for a run without validations.
         validation_images: folder of the images that a file at `validation` lists.
-        weights: see `read_start`.
-        backbone: see `read_start`.
+        weights: complete model to start from; see `read_start`.
+        backbone: checkpoint to take only the backbone from; see `read_start`.
         on_bad_image: "stop", or "skip" to leave unreadable images out.
         quiet: whether to hide progress bars.
         **grouping: how images become places; see `read_places`.
 
     Returns:
-        (places, validation, initial).
+        (training set, validation set or None, initial parameters or None for random ones).
 
     Raises:
-        InputError: in every process, if one cannot read its files or they do not fit.
+        InputError: in every process, if any process cannot read its files or they do not fit.
     """
     quiet = quiet or not distributed.is_primary()
 
@@ -149,17 +149,17 @@ def read_start(
 ) -> Crisalad | None:
     """Read the parameters that a run starts from.
 
-    Warn about weights that were made for images of another size or resized in another way.
+    Warn about weights that were trained on images of another size or resized in another way.
 
     Args:
         config: the run's configuration; `recipe` can make it for the model of given weights.
         weights: a complete model of this package, or the name of a published model.
         backbone: a checkpoint from which only the backbone is taken, public or of this package, or
             the name of a published model.
-        quiet: whether to hide the progress of a download.
+        quiet: whether to hide the progress bar of a download.
 
     Returns:
-        All parameters; None, which stands for random ones, if neither is given.
+        All parameters; None, which stands for random ones, without `weights` and `backbone`.
 
     Raises:
         InputError: both are given, or a file cannot be read or does not fit the model.
@@ -200,7 +200,7 @@ def with_vocabulary_of(
         The parameters, unchanged if the aggregator has no centroids.
 
     Raises:
-        InputError: what `with_vocabulary` raises.
+        InputError: an image cannot be read, or there are too few images for the centroids.
     """
     if not config.model.aggregator.starts_from_centroids:
         return initial

@@ -41,7 +41,7 @@ WHOLE_LOSS = 1024
 """Maximum number of images for which every device computes the whole loss, at most 1 % of a step's
 work (docs/training.md). For more images, XLA splits the loss and exchanges its parts."""
 LossFunction = Callable[..., Float[Array, ""]]
-"""Takes descriptors, labels and, if it has a third argument, which images are valid."""
+"""Takes (descriptors, labels), (descriptors, labels, valid) or a `LossBatch`."""
 
 
 @brief
@@ -66,7 +66,7 @@ class TrainState(NamedTuple):
 
     @property
     def averaged(self) -> PyTree:
-        """`trainable` for validation and saving: the optimiser's average, if it has one."""
+        """`trainable` for validation and saving, averaged over steps if the optimiser does that."""
         statistics, learnt = split_statistics(self.trainable)
         return eqx.combine(averaged_weights(self.optimiser, learnt), statistics)
 
@@ -77,25 +77,25 @@ class Metrics(NamedTuple):
 
     loss: Float[Array, ""]
     easy_anchor_fraction: Float[Array, ""]
-    """Share of the anchors whose positives are all easy."""
+    """Share of the anchors whose positives are all too easy for the miner to choose."""
     accuracy: Float[Array, ""] | None
     """Share of the images that are nearest to their own class; None without classification."""
     loss_numbers: Mapping[str, Array] | None
     """Other scalars of the loss (`LossValue.numbers`)."""
     gradient_norm: Float[Array, ""]
-    """Norm of the whole gradient, including a classifier's."""
+    """Euclidean norm of the whole gradient before clipping, loss parameters included."""
     learning_rate: Float[Array, ""] | None
     """Learning rate of this step; None for an optimiser that was passed in."""
     images: Int[Array, ""]
     """Number of valid images."""
     transport: TransportStatistics | None
-    """Means over the valid images, with dropout; None if the aggregator has no transport."""
+    """Means over valid images, with dropout if any; None if the aggregator has no transport."""
     updated: Bool[Array, ""]
-    """Whether the step was taken, not skipped."""
+    """Whether the step was taken; False if it was skipped."""
 
 
 def named_scalars(values: Metrics | TransportStatistics) -> dict[str, float]:
-    """List scalars by name, without None: the transport's unprefixed, a loss's as `loss.NAME`."""
+    """Return scalars by name, without None or the prefix `transport.`; a loss's are `loss.NAME`."""
     return {
         name.removeprefix("transport.").replace("loss_numbers.", "loss.", 1): float(leaf)
         for name, leaf in named_leaves(values).items()
@@ -104,7 +104,7 @@ def named_scalars(values: Metrics | TransportStatistics) -> dict[str, float]:
 
 @dataclasses.dataclass(frozen=True)
 class StepConfig:
-    """The static argument of a compiled step."""
+    """The static argument of a compiled training step: all settings that it depends on."""
 
     model: ModelConfig
     loss: LossConfig
@@ -115,7 +115,7 @@ class StepConfig:
     """Number of steps of an epoch, for schedules by epochs and for gradient accumulation, which
     ends with each epoch."""
     micro_batch: int | None = None
-    """See `nn.model.extract_tokens`."""
+    """Number of images that pass through the backbone at a time; None is the whole batch."""
     shard_over: Mesh | None = None
     """Devices to shard the state over, as `devices.shard_spec` says; None replicates it.
 
@@ -124,7 +124,7 @@ class StepConfig:
     classes: tuple[int, ...] = ()
     """Number of classes of each group, if the loss classifies; an epoch trains one group."""
     batch_norm: Literal["batch", "stored"] = "batch"
-    """See `TrainConfig.batch_norm`."""
+    """Whether batch norms use the statistics of the batch or the stored ones."""
     tuples: bool = False
     """Whether labels are those of mined tuples (`tuple_labels`), not of places."""
     mixture: tuple[MixtureSet, ...] = ()
@@ -169,7 +169,7 @@ def init_train_state(
 
     Args:
         params: parameters to start from.
-        trainable: see `split_params`.
+        trainable: which parameters train, as `split_params` takes it.
         config: the step's configuration, from `step_config`.
         key: random key for the parameters of the loss, if it has any.
 
@@ -177,8 +177,8 @@ def init_train_state(
         (state, frozen). The state is a copy, so `params` can still be used.
 
     Raises:
-        InputError: what `split_params` raises; no parameter would train, or the aggregator cannot
-            (AnyLoc's); or the loss lacks a key or classes.
+        InputError: `trainable` does not fit the model; no parameter would train, or the aggregator
+            (AnyLoc's) cannot be trained; or the loss lacks a key or numbers of classes.
 
     Example:
         >>> import jax
@@ -236,10 +236,10 @@ def step_config(
         config: the run's configuration.
         steps: number of steps of the run.
         steps_per_epoch: number of steps of an epoch.
-        optimiser: any optax optimiser, in place of the configuration's.
-        loss: any function of (descriptors, labels) or (descriptors, labels, valid), or of a
-            `LossBatch`, that returns a number, in place of the configuration's.
-        classes: number of classes of each group, for a loss that classifies.
+        optimiser: any optax optimiser, in place of the configuration's optimiser and schedule.
+        loss: any function of (descriptors, labels), (descriptors, labels, valid) or a `LossBatch`
+            that returns a scalar, in place of the configuration's loss and miner.
+        classes: number of classes of each group of classes, for a loss that classifies.
         shard_over: devices to shard the state over; None replicates it.
 
     Returns:
@@ -342,18 +342,18 @@ def train_step(
     proceed: Bool[Array, ""] | bool = True,
     targets: Float[Array, "image target"] | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """Take one optimiser step on the loss of a batch, or accumulate its gradient for one.
+    """Take an optimiser step on the loss of a batch, or accumulate its gradient for a later step.
 
-    The gradient is that of the trainable parameters, and of the loss's parameters for the epoch's
-    group; labels are that group's classes if the loss classifies. Dropout is drawn from `key` and
-    the step number, so that a resumed run repeats an uninterrupted one.
+    The trainable parameters and the loss's own parameters change. If the loss classifies, only the
+    group of classes of the current epoch trains, and labels are classes of that group. Dropout is
+    drawn from `key` and the step number, so that a resumed run repeats an uninterrupted one.
 
-    Running statistics in the state are updated as by torch's batch norms in training mode, and the
-    batch is normalised by its own. If the state has none, the stored ones are used.
+    Batch-norm statistics in the state are updated as in torch's training mode, and the batch is
+    normalised by its own. If the state has none, the stored statistics normalise it.
 
     If the loss or the gradient is not finite, or no image is valid, the state is returned unchanged
-    and `Metrics.updated` is False. Passed to the next step as `proceed`, False skips that step too:
-    a loop can read metrics one step late and still have the state before the failed step.
+    and `Metrics.updated` is False. Passed to the next step as `proceed`, False skips it too, so a
+    loop can read metrics one step late and still have the state before the failed step.
 
     A loss that learns from a teacher takes the teacher's descriptors of the images as `targets`.
     """
@@ -402,9 +402,9 @@ class BatchLoss(NamedTuple):
     transport: TransportStatistics | None
     """Means over the valid images."""
     statistics: PyTree
-    """Running statistics after the batch."""
+    """Running statistics of batch norms after the batch."""
     valid: Bool[Array, " image"]
-    """Valid images of all devices."""
+    """Which images are valid, on all devices."""
 
 
 def loss_and_gradient(
@@ -420,14 +420,14 @@ def loss_and_gradient(
     """Compute the loss of a batch and its gradient inside a trace; see `train_step`.
 
     Args:
-        state: the state; its optimiser is not read.
+        state: the training state; its optimiser is not read.
         frozen: parameters that do not train.
-        images: see `train_step`.
-        labels: see `train_step`.
-        valid: see `train_step`.
+        images: pixels of the images.
+        labels: place or class of each image, or labels of mined tuples (`tuple_labels`).
+        valid: which images take part.
         key: random key for dropout; None disables it.
         config: the step's configuration.
-        targets: a teacher's descriptors, for a loss that reads them.
+        targets: a teacher's descriptors of the images, for a loss that compares them.
 
     Returns:
         The results of the forward pass, and the gradients of the trainable parameters and of the

@@ -12,13 +12,13 @@ from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD, count_train
 
 
 class AdapterSummary(NamedTuple):
-    """One of a model's adapters."""
+    """Counts of one of a model's adapters."""
 
     parameters: int
     macs: int
     """Multiply-accumulates per image, with linear layers at all tokens."""
     paper_macs: int
-    """Multiply-accumulates as in the paper: each linear layer once, convolutions at every patch."""
+    """The paper's count: each linear layer at one token, convolutions at every patch."""
 
 
 @brief
@@ -34,7 +34,7 @@ class ModelSummary(NamedTuple):
     descriptor: int
     """Length of a descriptor."""
     trainable: str
-    """What trains, as `split_params` takes it."""
+    """Which parameters train, as `split_params` takes it."""
     trainable_parameters: int
     frozen_parameters: int
     parts: list[PartCost]
@@ -51,7 +51,7 @@ def model_summary(
 
     Args:
         config: the model's configuration.
-        trainable: what trains, as `split_params` takes it. None is the adapters and the head, or
+        trainable: which parameters train, for `split_params`. None is the adapters and the head, or
             only the head if there are no adapters.
         images: number of images that attend to each other in the cross-image encoder.
 
@@ -59,7 +59,7 @@ def model_summary(
         The counts.
 
     Raises:
-        InputError: what `split_params` raises; or `images` below 1.
+        InputError: `trainable` does not fit the model (`split_params`), or `images` is below 1.
 
     Example:
         >>> from crisalad_jax import PRESETS
@@ -96,7 +96,7 @@ def model_words(config: ModelConfig) -> str:
         config: the model's configuration.
 
     Returns:
-        Clauses without a full stop.
+        Clauses separated by semicolons, without a full stop.
 
     Example:
         >>> from crisalad_jax import PRESETS
@@ -113,7 +113,7 @@ def model_words(config: ModelConfig) -> str:
 
 
 def summary_json(summary: ModelSummary, name: str) -> dict[str, Any]:
-    """Convert a summary to JSON values; `name` is the model's."""
+    """Convert a summary to JSON values, with the model's `name`."""
     values: dict[str, Any] = {"model": name} | summary._asdict()
     values["image_size"] = list(summary.image_size)
     values["parts"] = [cost._asdict() for cost in summary.parts]

@@ -1,4 +1,4 @@
-"""Choose which parameters train, and split a model into these and the frozen ones."""
+"""Choose which parameters train, and split a model into trainable and frozen parameters."""
 
 import dataclasses
 import difflib
@@ -63,14 +63,14 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
     The paper trains "adapters,head", SALAD "last-4-blocks,norm,head".
 
     If only some parameters of the blocks train, the stack of blocks is cut; `merge_params` joins
-    it. No gradient is then computed in frozen blocks before the first trainable one, nor, if only a
-    part of that block trains, for its input. Batch-norm statistics have no gradient and count as
-    frozen, though a step may update them. Aggregators that learn nothing (AnyLoc's) count so too.
+    it. No gradient is then computed in frozen blocks before the first trainable one, nor for the
+    input of that block if only a part of it trains. Always frozen are batch-norm statistics, though
+    a step may update them, and aggregators that learn nothing (AnyLoc's).
 
     Args:
         params: the whole model.
         config: the model's configuration.
-        trainable: the list above.
+        trainable: the list described above.
 
     Returns:
         (trainable, frozen): two trees of the model's structure, with None for the other's leaves.
@@ -113,7 +113,7 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
 
 
 def numbered_names(params: Crisalad, config: ModelConfig) -> dict[str, list[str]]:
-    """Return the names of each parameter; for a stack of blocks, one for each block's number."""
+    """Return the names of each leaf: its own, or for stacked blocks, one for each block."""
     depth, names = config.backbone.depth, {}
     for leaf, value in named_leaves(params).items():
         rest = leaf.removeprefix(_BLOCKS)
@@ -124,7 +124,7 @@ def numbered_names(params: Crisalad, config: ModelConfig) -> dict[str, list[str]
 
 
 def choose(params: Crisalad, config: ModelConfig, trainable: str) -> dict[str, tuple[bool, ...]]:
-    """Return whether each parameter trains; for a stack of blocks, block by block."""
+    """Return whether each leaf trains: one boolean, or for stacked blocks one for each block."""
     backbone, names = config.backbone, numbered_names(params, config)
 
     def matched(*patterns: str) -> set[tuple[str, int]]:

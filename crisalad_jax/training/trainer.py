@@ -50,7 +50,7 @@ class Trainer:
         shard_state: bool,
         targets: np.ndarray | None = None,
     ) -> None:
-        """Make the state before the first step; see `fit` for the arguments.
+        """Make the state before the first step; `data` yields the batches; see `fit` for the rest.
 
         Raises:
             InputError: the configuration does not fit the model or the devices.
@@ -89,7 +89,7 @@ class Trainer:
         self.state = jax.jit(lambda state: jax.tree.map(jnp.copy, state))(self._place(state))
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
-        """Return batches on the devices, each copied while they compute the previous one."""
+        """Yield batches on the devices, each copied while the devices compute the previous one."""
         return one_ahead(self._batch(batch) for batch in batches)
 
     def start_step(self, batch: Batch | None, waited: float) -> None:
@@ -98,8 +98,8 @@ class Trainer:
         After a step that is not taken, no later one is taken either (`train_step`).
 
         Args:
-            batch: the images; None if this process has failed to read them.
-            waited: seconds spent waiting for them.
+            batch: the batch; None if this process has failed to read it.
+            waited: seconds spent waiting for the batch.
         """
         if not self._running:
             self._finished_at = time.monotonic() - waited
@@ -117,8 +117,8 @@ class Trainer:
             The metrics to log for each step.
 
         Raises:
-            InputError: no image of a step could be read.
-            LossNotFiniteError: a step was not taken because of its loss; `state` is the one before.
+            InputError: none of a step's images could be read.
+            LossNotFiniteError: the loss or gradient was not finite; `state` precedes the step.
         """
         while len(self._running) > leave:
             metrics, size, waited = self._running.popleft()
@@ -151,7 +151,7 @@ class Trainer:
         return self._devices.gather(tree)
 
     def params(self, trainable: PyTree = None) -> Crisalad:
-        """Join the whole model in float32 from gathered trainable parameters; None gathers them."""
+        """Return the model in float32, with gathered `trainable` parameters; None gathers them."""
         if trainable is None:
             trainable = self.gather(self.state.averaged)
         return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)
@@ -198,7 +198,7 @@ class Trainer:
 
 
 def run_keys(seed: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
-    """Make the keys that draw a run's initial parameters, its dropout, and its classifiers."""
+    """Make the random keys of a run: for initial parameters, dropout and the loss's parameters."""
     key = jax.random.key(seed)
     params, dropout = jax.random.split(key)
     # Folds in 2, because folding in 0 or 1 may repeat the keys of the split.

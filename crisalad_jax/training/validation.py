@@ -20,7 +20,7 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.step import named_scalars
 
 WATCHED_QUERIES = 16
-"""Number of images whose transport statistics every validation logs."""
+"""Number of queries whose mean transport statistics every validation logs."""
 MONITORED = {"R@1": (1,), "R@5": (5,), "R@1+R@5": (1, 5)}
 """Ranks whose recalls are added, by `TrainConfig.monitor`."""
 DESCRIBED_AT_ONCE = 16
@@ -42,10 +42,10 @@ class Validator:
     """Evaluates the model of a run between its steps."""
 
     def __init__(self, config: TrainConfig, benchmark: Benchmark | None, reading: Reading) -> None:
-        """Check the benchmark's ground truth; without a benchmark no validation is due.
+        """Check the benchmark's ground truth; without a benchmark, no validation is ever due.
 
         Raises:
-            InputError: it has none.
+            InputError: the benchmark has no ground truth.
         """
         if benchmark is not None:
             benchmark.ground_truth()
@@ -68,7 +68,7 @@ class Validator:
         return self._benchmark is not None and rest == 0 and step > last and asked
 
     def validate(self, params: Crisalad) -> Validation:
-        """Evaluate the model on single images, and compute its transport statistics."""
+        """Evaluate the model with grouping `single`, and compute its transport statistics."""
         assert self._benchmark is not None
         (result,) = evaluate(
             Model(params, self._model),
@@ -91,7 +91,7 @@ class Validator:
         return Validation(monitored, recalls | watched, words)
 
     def describe(self, params: Crisalad, paths: Sequence[pathlib.Path]) -> np.ndarray:
-        """Describe image files independently; NaN for those that cannot be read."""
+        """Compute single-image descriptors of files; rows of unreadable files are NaN."""
         model = self._config.model
         rows = np.full((len(paths), model.descriptor_dim), np.nan, np.float32)
         reading = dataclasses.replace(self._reading, batch_size=DESCRIBED_AT_ONCE)

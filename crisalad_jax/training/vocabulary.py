@@ -66,7 +66,7 @@ def with_vocabulary(
         paths: images; not those used for evaluation.
         images: maximum number of images, drawn at random; None for all, whose features must fit in
             memory.
-        seed: seed of the images, of `PATCHES` patches of each, and of the first centroids.
+        seed: seed for drawing images, up to `PATCHES` patches of each, and first centroids.
         batch_size: number of images described at a time.
         on_bad_image: "stop", or "skip" to leave unreadable images out.
         quiet: whether to hide the progress bar.
@@ -75,9 +75,9 @@ def with_vocabulary(
         The parameters with the centroids.
 
     Raises:
-        InputError: a model without a vocabulary; an argument out of range; an image that cannot be
-            read, or none that can; fewer features than clusters or than VLAD-BuFF's components,
-            or features that are not finite or all equal.
+        InputError: the aggregator has no vocabulary; an argument is out of range; an image, or
+            all, cannot be read; there are fewer features than clusters or than VLAD-BuFF's
+            principal components; or features are not finite, or all equal.
     """
     params, config = model
     aggregator = config.aggregator
@@ -123,7 +123,7 @@ class Vocabulary(NamedTuple):
     words: int
     """Number of centroids."""
     images: int
-    """Number of images selected for features."""
+    """Number of images selected to extract features from."""
 
 
 def start_vocabulary(
@@ -207,7 +207,7 @@ def build_vocabulary(
         The parameters, and the numbers of centroids and images.
 
     Raises:
-        InputError: what `with_vocabulary` raises; no image; or a file that cannot be written.
+        InputError: no vocabulary, too few or unreadable images, or `out` cannot be written.
 
     Example:
         >>> import jax
@@ -276,15 +276,15 @@ def _read_features(
 def k_majority(
     features: Float[np.ndarray, "feature dim"], clusters: int, seed: int
 ) -> Float32[np.ndarray, "cluster dim"]:
-    """Cluster binary features by Hamming distance; a centroid has the majority's bits.
+    """Cluster binary features by Hamming distance; a centroid takes each bit by majority vote.
 
     It is the clustering of Galvez-Lopez and Tardos (T-RO 2012), without a tree: the first centroids
     are drawn as in k-means++, and a bit without a majority stays the same.
 
     Args:
-        features: features of two values; see `Backbone.binary`.
+        features: features whose elements are all +a or -a, for one a; see `Backbone.binary`.
         clusters: number of centroids.
-        seed: seed of the first centroids.
+        seed: seed for drawing the first centroids.
     """
     size = np.abs(features).max()
     bits = np.sign(features).astype(np.float32)

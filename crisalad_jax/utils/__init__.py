@@ -1,1 +1,1 @@
-"""Errors, files, devices, signals and progress, for all packages; imports none of them."""
+"""Errors, files, devices, signals and progress, for all subpackages; imports none of them."""

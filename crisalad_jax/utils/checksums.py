@@ -14,7 +14,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
 CHECKSUM = "checksum"
-"""Key of the digest, the first of its object."""
+"""Key of the digest, the first key of the JSON object."""
 _BLANK = "0" * 64
 
 
@@ -36,11 +36,11 @@ def check_checksum(data: bytes, digest: Any, path: object) -> None:
 
     Args:
         data: the bytes.
-        digest: the value at `CHECKSUM` among them.
+        digest: the value of the key `CHECKSUM` in the file.
         path: the file, for the message.
 
     Raises:
-        ChangedFileError: they do not match.
+        ChangedFileError: the bytes and the checksum do not match.
     """
     blank = data.replace(str(digest).encode(errors="replace"), _BLANK.encode(), 1)
     if hashlib.sha256(blank).hexdigest() != digest:
@@ -59,5 +59,5 @@ class ChangedFileError(InputError):
 
 
 def tell_unchecked(path: object, missing: str = "no checksum") -> None:
-    """Warn that a file, such as one of another program, has no checksum."""
+    """Warn that a file is not checked, as it has no checksum; `missing` says what it lacks."""
     warn(f"{path}: found {missing}, as in files of other programs; not checked")

@@ -48,10 +48,10 @@ _TRIES = 5
 
 
 def check_cluster(address: str | None) -> tuple[str, int] | None:
-    """Return host and port of a cluster's address; None for None, "local" and "auto".
+    """Return the host and port of a cluster's address; None for None, "local" and "auto".
 
     Raises:
-        InputError: it is not an address.
+        InputError: `address` is none of these, nor ray://HOST[:PORT] or HOST:PORT.
     """
     if address in (None, "local", "auto"):
         return None
@@ -161,7 +161,7 @@ def _within(seconds: float, work: Callable[[], Any]) -> bool:
 
 
 def check_nodes(ray: Any, *, read: Sequence[str] = (), write: pathlib.Path | None = None) -> None:
-    """Check that every node has this package, and the files that this machine has.
+    """Check that every node has this package, and can read and write the same files.
 
     Args:
         ray: the module, from `connected`.
@@ -280,7 +280,7 @@ class _Worker:
 
 
 def with_notes(work: Callable[..., _Result], *given: Any) -> tuple[_Result, list[str]]:
-    """Return a function's result, and its notes, for another process to show."""
+    """Call a function; return its result and its `Note` warnings, for another process to show."""
     with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always", Note)
         result = work(*given)
@@ -298,14 +298,14 @@ def map_in_order(
     """Yield the result of `work` for each item, in the order of the items.
 
     If a worker is lost, its item goes to another, and a new worker is started where there is room.
-    Only a few items are started ahead of the one that is asked for.
+    Only a few items are started ahead of the next one to yield.
 
     Args:
         ray: the module, from `connected`.
         work: a function that can be pickled.
         items: what to work on.
         prepare: called in each process before `work` is unpickled.
-        environment: variables that are set in each process before that.
+        environment: environment variables that are set in each process before `prepare`.
 
     Raises:
         InputError: an InputError of `work`, with the node's name; workers end repeatedly; or none

@@ -47,8 +47,8 @@ def compiler_options(
 ) -> dict[str, bool | str]:
     """Return XLA's options for a program: none, except on a CPU with a tested version of JAX.
 
-    Another version may lack an option, or crash with it; without any, a program is just as correct,
-    at most slower. A program that `runs_long`, such as a training step, is not scheduled for the
+    Another version may lack an option, or crash with it; without options, a program is as correct,
+    but may be slower. A program that `runs_long`, such as a training step, is not scheduled for the
     least memory, which would make it 6 % slower. The options depend on the processor, and on the
     `compute_dtype` of the program's model, None without a model.
     """
@@ -66,17 +66,17 @@ class Jitted(Protocol[_P, _R]):
         ...
 
     def lower(self, *args: Any, **kwargs: Any) -> jax.stages.Lowered:
-        """Lower the function for the `target`; arguments may be shapes."""
+        """Lower the function for `target()`; arguments may be `jax.ShapeDtypeStruct`."""
         ...
 
 
 def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) -> Jitted[_P, _R]:
-    """Wrap a function in `jax.jit` with `compiler_options`, outside of other transformations.
+    """Wrap a function in `jax.jit`, with `compiler_options` in addition to the given `options`.
 
-    Inside another transformation the options of the outermost `jit` apply, because JAX accepts no
-    others. On accelerators float32 products have the `precision` of a configuration among the
-    arguments; on all platforms, numbers have the types of `number_types`. The returned function
-    also has `lower`, which lowers for the `target`.
+    Inside another transformation, such as `jax.grad`, compiler options are those of the outermost
+    `jit`: JAX accepts no others. On accelerators, float32 products have the `precision` of a
+    configuration among the arguments; on all platforms, numbers have the types of `number_types`.
+    The returned function also has `lower`, which lowers for `target()`.
     """
     inner = jax.jit(function, **options)
 
@@ -120,9 +120,9 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
 def number_types(leaves: Sequence[Any] = ()) -> Iterator[None]:
     """Compute in JAX's 32-bit mode, unless a configuration among the `leaves` is of float64.
 
-    A program may use the 64-bit mode for another package. Numbers without an explicit type, as in
-    `jnp.zeros` or an optimiser's schedule, would then be float64, and results would differ. It may
-    also forbid promotion or compilation, which the code here relies on.
+    The calling program may enable 64-bit mode for another package. Numbers without an explicit
+    type, as in `jnp.zeros` or an optimiser's schedule, would then be float64, and results would
+    differ. It may also forbid type promotion or compilation, which this package relies on.
     """
     wide = any(getattr(leaf, "compute_dtype", None) == "float64" for leaf in leaves)
     with (
@@ -154,7 +154,7 @@ class Session(NamedTuple):
     devices: int
     """Number of devices; a CPU counts as one for each core."""
     cache: str | None
-    """Folder of compiled programs; None if none can be written."""
+    """Folder of compiled programs; None if no folder can be written to."""
 
     def __repr__(self) -> str:
         """Return one line for a notebook."""

@@ -15,7 +15,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.target import machine, target
 
 SHARD_FROM = 2**14
-"""Smallest number of elements of a sharded array: gathering smaller ones costs too much."""
+"""Minimum number of elements to shard an array: gathering smaller ones costs too much."""
 
 
 IMAGE = "image"
@@ -40,7 +40,7 @@ class Devices(NamedTuple):
     def replicate(self, tree: _Tree) -> _Tree:
         """Replicate arrays on all devices; every process must give the same arrays.
 
-        The virtual devices of a CPU share one buffer with a numpy array, which must not be changed.
+        A CPU's virtual devices may share the buffer of a numpy array: do not change the array.
         """
         here = Mesh(np.array(self.mesh.local_devices), (IMAGE,))
 
@@ -84,7 +84,7 @@ class Devices(NamedTuple):
 
 
 def shard_spec(mesh: Mesh, shape: tuple[int, ...]) -> NamedSharding:
-    """Return the sharding of an array: along its longest axis that the devices divide.
+    """Return the sharding of an array, along the longest axis that the device count divides.
 
     Small arrays, and arrays without such an axis, are replicated.
     """
@@ -96,7 +96,7 @@ def shard_spec(mesh: Mesh, shape: tuple[int, ...]) -> NamedSharding:
 
 
 def devices_for(count: int, *, processes: bool = False) -> Devices:
-    """Choose the most devices that divide `count` images, from this process or equally from all.
+    """Choose the most devices that share `count` images equally, of this process or of all.
 
     Raises:
         InputError: the processes cannot share the images equally.
@@ -113,9 +113,9 @@ def devices_for(count: int, *, processes: bool = False) -> Devices:
 
 
 def parts_for_caches(images: int, at_once: int) -> int:
-    """Return how many parts a CPU splits a batch into, to compute them one after the other.
+    """Return the number of parts in which a CPU computes a batch, one after the other.
 
-    Activations of a few images stay in its caches. Other platforms do not split the batch.
+    Activations of a few images fit into its caches. Other platforms do not split the batch.
 
     Args:
         images: number of images, which may be spread over devices as `devices_for` chooses them.
@@ -144,7 +144,7 @@ def over_images(argument: str, position: int) -> Callable[[_F], _F]:
         position: its place among the arguments.
 
     Returns:
-        The decorator; it preserves `lower`.
+        The decorator; the decorated function still has `lower`.
     """
 
     def decorate(function: _F) -> _F:
@@ -198,7 +198,7 @@ def whole_on_each(function: Callable[..., _Tree]) -> Callable[..., _Tree]:
 
 
 def gather_images(tree: _Tree) -> _Tree:
-    """Gather arrays whose first axis is of images, so that every device has all of them.
+    """Gather arrays whose first axis counts images, so that every device has all images.
 
     XLA would otherwise split what follows, and exchange its parts. On one device it does nothing.
     """

@@ -16,7 +16,7 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.version import VERSION
 
 OFFLINE = "CRISALAD_OFFLINE"
-"""Environment variable: whether to forbid the network."""
+"""Name of the environment variable that forbids use of the network."""
 _CHUNK = 2**18
 _MEGABYTE = 1e6
 _PARTIAL, _NO_SUCH_RANGE = 206, 416
@@ -48,22 +48,22 @@ def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False)
     """Download a file to `target`, which appears only when it is complete.
 
     What has arrived of an unfinished download stays in `target`.part, with the server's
-    description of it. The next call resumes from there if the server still has the same file: the
-    same length, and the same ETag or modification time. If it gives neither, the next call starts
-    again.
+    description of the file. The next call resumes from there if the server still has the same
+    file: the same length, and the same ETag or modification time. If the server gives neither, the
+    next call starts again.
 
     Proxies are those of the environment: `http_proxy`, `https_proxy`, `no_proxy`.
 
     Args:
-        url: the address, of http, https or file.
+        url: an http, https or file URL.
         target: the file, in an existing folder that no other process writes to.
         label: text in front of the progress bar.
         quiet: whether to hide the progress bar.
 
     Raises:
         MissingFileError: the file does not exist.
-        InputError: the server refuses, stalls or fails in every attempt; or the disk is full, the
-            only case in which the unfinished file is removed.
+        InputError: the server refuses, stalls or fails in every attempt; or the file cannot be
+            written, for example to a full disk, in which case the unfinished file is removed.
 
     Example:
         >>> _ = (folder / "there.txt").write_text("all of it")

@@ -18,7 +18,7 @@ class InputError(ValueError):
 
 @contextlib.contextmanager
 def locate_errors(before: str = "", after: str = "") -> Iterator[None]:
-    """Add where the input is to the message of an InputError that the block raises."""
+    """Add `before` and `after` to the message of an InputError that the block raises."""
     try:
         yield
     except InputError as error:
@@ -26,7 +26,7 @@ def locate_errors(before: str = "", after: str = "") -> Iterator[None]:
 
 
 def how_ended(number: int) -> str:
-    """Describe the signal that ends a program, the same way for every command."""
+    """Describe how a signal, given by its number, ended a program; the same for every command."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 
 
@@ -42,9 +42,9 @@ def few(problems: Sequence[str]) -> str:
 
 
 class Interrupted(Exception):
-    """A signal to end the program, whose work is saved."""
+    """The end of a program by a signal, after which its saved work can be resumed."""
 
     def __init__(self, number: int, where: str = "") -> None:
-        """Take the signal's number; `where` says in a few words how far the work is."""
+        """Take the signal's number; `where` says in a few words how far the work has got."""
         super().__init__(f"{how_ended(number)} {where}".rstrip())
         self.number = number

@@ -50,7 +50,7 @@ def cache_executables() -> None:
     """Cache compiled programs from now on, in a folder that only the user can write to.
 
     Call it only in a program that runs nothing but this package: code that is changed at run time,
-    as in a notebook, is not part of the key. Without such a folder, nothing is cached.
+    as in a notebook, is not part of the key. If no such folder can be made, nothing is cached.
     """
     with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
         folder = user_cache() / "programs"
@@ -70,15 +70,15 @@ def cached_executable(
     """Find the compiled program for a call, in this process or on disk, or else compile it.
 
     Args:
-        function: what is traced, outside of other transformations, for this machine.
+        function: the function, called outside of other transformations, for this machine.
         jitted: the same function under `jax.jit`.
         args: positional arguments of the call.
-        kwargs: arguments by name.
-        static_argnames: names of those that are part of the program.
+        kwargs: keyword arguments of the call.
+        static_argnames: names of the arguments whose values are compiled into the program.
 
     Returns:
-        A function that calls it; None if programs are not cached: on accelerators, and for a lambda
-        or a function defined in another, since the key does not cover its closure.
+        A function that runs the program; None without a cache, on accelerators, with several
+        processes, and for lambdas and nested functions, whose closure the key does not cover.
     """
     if _Folder.path is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return None

@@ -17,11 +17,11 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
 }
-"""Modules of each extra, by its name; if two have a module, the smaller extra comes first."""
+"""Modules of each extra, by its name; if two have the same module, the smaller comes first."""
 
 
 def missing_extra(error: ModuleNotFoundError, what: str) -> str:
-    """Return a message that names the extra of a missing module, and how to install it.
+    """Return a message, beginning with `what`, on the extra that installs a missing module.
 
     Raises:
         ModuleNotFoundError: the error itself, if no extra has the module.

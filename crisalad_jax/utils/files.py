@@ -23,10 +23,10 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 LARGEST = 2**30
-"""Maximum bytes of a file that is read into memory, such as a text or an image: a sparse file may
-claim any number."""
+"""Maximum bytes of a file that is read into memory, such as an image: a sparse file may claim any
+number."""
 LARGEST_TEXT, _LARGEST_JSON = 2**27, 2**26
-"""The same for texts and JSON, whose characters and values take many times as much memory."""
+"""The same for text and JSON, whose characters and values take many times as much memory."""
 
 
 def is_html(start: bytes) -> bool:
@@ -50,8 +50,8 @@ def check_source(
         largest: maximum size in bytes; None is any.
 
     Raises:
-        InputError: there is none, it is larger, or it is not a file but a folder, a pipe or a
-            device. Opening a pipe may wait forever, and a device may never end.
+        InputError: there is no file, it is larger, or `path` is a folder, a pipe or a device.
+            Opening a pipe may wait forever, and a device may never end.
     """
     found = _kind_of(path)
     if found == _FILE:
@@ -84,8 +84,8 @@ def user_cache() -> pathlib.Path:
     """Return the folder of everything that this package caches, which need not exist yet.
 
     It is `CRISALAD_CACHE`, or else `crisalad-jax` in the user's cache folder, which
-    `XDG_CACHE_HOME` may set; a relative path there is ignored, as the XDG Base Directory
-    Specification requires. Its folders are models, exports, programs, teachers, xla and numba.
+    `XDG_CACHE_HOME` may set; a relative path there is ignored, as in the XDG Base Directory
+    Specification. Its folders are models, images, exports, programs, teachers, xla and numba.
 
     Raises:
         RuntimeError: the user has no home folder.
@@ -107,7 +107,7 @@ def read_bytes(path: str | os.PathLike[str], expected: str, *, largest: int = LA
         largest: maximum size in bytes.
 
     Raises:
-        InputError: what `check_source` raises.
+        InputError: there is no regular file at `path`, or it is larger.
         PermissionError: the file may not be read.
     """
     check_source(path, expected, largest=largest)
@@ -118,7 +118,7 @@ def read_text(path: str | os.PathLike[str], expected: str) -> str:
     """Read a UTF-8 text file of at most `LARGEST_TEXT` bytes; drop a byte order mark.
 
     Raises:
-        InputError: what `read_bytes` raises, or the bytes are not UTF-8.
+        InputError: there is no regular file at `path`, it is larger, or it is not UTF-8.
     """
     try:
         return read_bytes(path, expected, largest=LARGEST_TEXT).decode("utf-8-sig")
@@ -134,7 +134,7 @@ def parse_json(text: str | bytes, source: str, expected: str) -> Any:
     Args:
         text: the JSON.
         source: what the message begins with, such as a file's name.
-        expected: what it should hold.
+        expected: what the JSON should hold, for the message.
 
     Raises:
         InputError: it is not JSON, has a key twice in an object, or is nested deeper than anything
@@ -163,13 +163,13 @@ def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = Tru
     Args:
         path: the file.
         expected: what kind of file, for messages.
-        sealed: whether the file must hold a checksum; users who edit a configuration remove it.
+        sealed: whether the file must hold a checksum; a user who edits a file removes it.
 
     Returns:
         The value, without its checksum; an object if the file must hold one.
 
     Raises:
-        InputError: what `read_bytes` and `parse_json` raise; or the checksum does not match.
+        InputError: the file cannot be read, is not JSON, or lacks or does not match its checksum.
     """
     data = read_bytes(path, expected, largest=_LARGEST_JSON)
     value = parse_json(data, str(path), expected)
@@ -181,7 +181,7 @@ def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = Tru
 
 
 def real_path(path: str | os.PathLike[str]) -> pathlib.Path:
-    """Return the absolute path without links; unlike pathlib it accepts circular links."""
+    """Return the absolute path with links resolved; unlike in pathlib, they may be circular."""
     return pathlib.Path(os.path.realpath(path))
 
 
@@ -210,7 +210,7 @@ def check_folder(path: str | os.PathLike[str]) -> None:
     """Check that files can be made in a folder, which need not exist yet.
 
     Raises:
-        InputError: what `check_target` raises.
+        InputError: `path` is something other than a folder, or cannot be made or written to.
     """
     _check_place(path, _FOLDER, "a folder or nothing yet")
 
@@ -272,7 +272,7 @@ def check_format(what: str, path: str | os.PathLike[str], *suffixes: str) -> Non
     """Check that a file's suffix matches the format that the file will have.
 
     Args:
-        what: the flag, for the message.
+        what: the flag that gives the path, for the message.
         path: the file; a name without a suffix is accepted.
         suffixes: what it may end with, as in ".json".
 
@@ -310,12 +310,12 @@ def atomic_path(
 
     Args:
         path: the file.
-        within: a folder on the same disk, cleared by its owner, for the temporary file; None is
+        within: a folder on the same disk for the temporary file, cleared by its owner; None is
             the folder of `path`.
         durable: whether to sync the file to disk, so that it survives a power failure.
 
     Raises:
-        InputError: what `check_target` raises; or the disk is full, or fails.
+        InputError: no file can be made at `path`; or the disk is full, or fails.
     """
     path = pathlib.Path(path)
     check_target(path)
@@ -349,7 +349,7 @@ def write_npy(path: pathlib.Path, array: np.ndarray) -> None:
     """Write an array as `np.save` does, but raise if the disk is full (`np.save` may not).
 
     Raises:
-        OSError: the disk is full, or what `open` raises.
+        OSError: the disk is full, or the file cannot be opened.
     """
     array = np.ascontiguousarray(array)
     with path.open("wb") as file:
@@ -370,7 +370,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """Yield a temporary folder next to `path`; rename it to `path` on success, else remove it.
 
     Raises:
-        InputError: what `check_new_folder` raises, or the parent folder cannot be made.
+        InputError: `path` exists and is not an empty folder, or it cannot be made.
     """
     path = pathlib.Path(path)
     check_new_folder(path)
@@ -389,7 +389,7 @@ def exchange(first: pathlib.Path, second: pathlib.Path) -> None:
     """Exchange the names of two folders atomically, with Linux's `renameat2`.
 
     Raises:
-        InputError: the system or the file system has no such call; both stay as they are.
+        InputError: the system or file system has no such call; both folders stay as they are.
     """
     call = _renameat2()
     here, both = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of <fcntl.h> and <linux/fs.h>
@@ -403,7 +403,7 @@ def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
     """Write an object as indented JSON with its checksum, atomically.
 
     Raises:
-        InputError: what `atomic_path` raises.
+        InputError: the file cannot be written.
     """
     data = checksummed_json(value, indent=2)
     with atomic_path(path) as temporary:

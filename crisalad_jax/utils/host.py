@@ -37,6 +37,6 @@ def available_memory() -> int:
 
 
 def most_files() -> int:
-    """Return how many files this process may have open, including connections."""
+    """Return how many files, including connections, this process may have open at once."""
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return 2**20 if files == resource.RLIM_INFINITY else files

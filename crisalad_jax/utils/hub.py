@@ -26,13 +26,13 @@ class HubAddress:
     """A repository at Hugging Face's hub, or a file in it."""
 
     repository: str
-    """As OWNER/NAME."""
+    """Owner and name, as OWNER/NAME."""
     revision: str | None = None
     """Branch, tag or commit; None is the main branch."""
     file: str | None = None
 
     def __str__(self) -> str:
-        """Write the address as a user does."""
+        """Return the address as hf://OWNER/NAME[@REVISION][/FILE]."""
         at = f"@{self.revision}" if self.revision else ""
         return f"{PREFIX}{self.repository}{at}{f'/{self.file}' if self.file else ''}"
 
@@ -51,7 +51,7 @@ def parse_hub(address: object) -> HubAddress:
     """Parse an address at the hub: hf://OWNER/NAME, optionally with @REVISION and /FILE.
 
     Raises:
-        InputError: it is not such an address.
+        InputError: `address` is not such an address.
 
     Example:
         >>> parse_hub("hf://owner/name@v1/model.safetensors")
@@ -76,7 +76,7 @@ def download_file(
 
     Args:
         address: the repository and the file.
-        is_dataset: whether it is a dataset repository.
+        is_dataset: whether it is a repository of a data set, not of a model.
         folder: where to store the file, under its path in the repository; None is the hub's cache.
         quiet: whether to hide the progress bar.
 
@@ -107,7 +107,7 @@ def download_file(
 def upload_folder(
     folder: pathlib.Path, address: HubAddress, message: str, *, quiet: bool = False
 ) -> str:
-    """Upload a folder to a new repository of models, or to one without files of the same names.
+    """Upload a folder to a model repository that is new or has no files of the same names.
 
     Args:
         folder: the folder.

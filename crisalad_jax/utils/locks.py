@@ -90,10 +90,10 @@ def _acquire(folder: pathlib.Path) -> contextlib.ExitStack | None:
 
 @contextlib.contextmanager
 def staged_folder(out: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
-    """Yield a temporary folder; on success move its files into `out`, pages last, else remove it.
+    """Yield a temporary folder; on success move its files into `out`, HTML last, else remove it.
 
     Raises:
-        InputError: what `lock` raises; or the disk is full.
+        InputError: another process holds the lock of `out`, or files cannot be written there.
     """
     out = pathlib.Path(out)
     with lock(out), wrap_os_errors(out):

@@ -20,7 +20,7 @@ def load_mat(
     largest: int = LARGEST,
     **options: Any,
 ) -> dict[str, Any]:
-    """Return the variables of a file.
+    """Read the variables of a `.mat` file, by their names.
 
     Args:
         path: the file.

@@ -41,7 +41,7 @@ def warn_once(about: str, message: str) -> None:
 
 @contextlib.contextmanager
 def print_notes() -> Iterator[None]:
-    """Print notes in one line on standard error; other warnings stay as Python shows them."""
+    """Print each `Note` as a line on standard error; other warnings stay as Python shows them."""
     show_warning = warnings.showwarning
 
     def show(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:

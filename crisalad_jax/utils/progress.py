@@ -22,7 +22,7 @@ class Bar:
             self._progress.update(self._task, advance=count, note=note)
 
     def say(self, line: str) -> None:
-        """Print a line that stays, above the bar."""
+        """Print a line that stays on the terminal, above the bar."""
         if self._progress is not None:
             self._progress.console.print(printable(line), soft_wrap=True, highlight=False)
         elif not self._quiet:

@@ -68,7 +68,7 @@ def check_drawn(tree: Any, where: str) -> None:
     An empty array cannot be a parameter, because optimisers divide by its size: use None instead.
 
     Raises:
-        InputError: naming `where` and the first leaf that is not.
+        InputError: one is not; the message names `where` and the leaf.
     """
     for name, leaf in named_leaves(tree).items():
         dtype = getattr(leaf, "dtype", type(leaf).__name__)
@@ -80,7 +80,7 @@ def check_drawn(tree: Any, where: str) -> None:
 
 
 def expect_like(name: str, found: Any, wanted: Any) -> None:
-    """Check that what a plug-in returned has the structure, shapes and types that it should have.
+    """Check that a plug-in's return value has the expected structure, shapes and types.
 
     Args:
         name: the plug-in's name, which begins the message.
@@ -88,7 +88,7 @@ def expect_like(name: str, found: Any, wanted: Any) -> None:
         wanted: a tree of arrays or of their shapes.
 
     Raises:
-        InputError: it does not.
+        InputError: the two differ.
 
     Example:
         >>> import numpy as np
@@ -138,18 +138,18 @@ _MOST = 24
 
 
 def summary(tree: Any) -> str:
-    """Write a line for each leaf, with its name, shape and type, and the totals below.
+    """Describe a pytree: a line for each leaf, with its name, shape and type, and the totals.
 
-    In a larger tree, a line counts all leaves whose names have the same prefix, and their
-    parameters, so that there are at most `_MOST` lines; `named_leaves` has all. Values are neither
-    read nor computed, so leaves may be arrays of any kind, tracers or `jax.ShapeDtypeStruct`. A
-    field that is None has no leaf. For a leaf without a shape, the line has its class.
+    In a tree of over 24 leaves, a line counts all leaves whose names have the same prefix, and
+    their parameters; `named_leaves` has all. Values are neither read nor computed, so leaves may be
+    arrays of any kind, tracers or `jax.ShapeDtypeStruct`. A field that is None has no leaf. For a
+    leaf without a shape, the line has its class.
 
     Args:
         tree: a pytree, such as a model's parameters.
 
     Returns:
-        The lines; parameters are the elements of all arrays.
+        The lines; the number of parameters counts the elements of all arrays.
 
     Example:
         >>> import jax

@@ -22,9 +22,9 @@ _SHOW_CURSOR = "\x1b[?25h\n"
 
 
 def end_at_signals() -> None:
-    """End this process at a signal with one line, and remove its temporary files.
+    """Set up handlers that end this process at a signal: print one line, remove temporary files.
 
-    Python runs handlers in the main thread, and not while a library works there: XLA may compile
+    Python runs handlers in the main thread, but not while a library works there: XLA may compile
     for minutes. A second thread then ends the process.
 
     Nothing is raised, because an exception at an arbitrary moment may be swallowed: in an import, a
@@ -49,7 +49,7 @@ _pipe = -1
 def watch() -> None:
     """Watch for signals in a second thread; call again before a library works in the main thread.
 
-    orbax writes with uvloop, which takes over the watching, and does not give it back.
+    orbax writes with uvloop, which takes over the watching of signals, and does not give it back.
     """
     if _pipe >= 0 and threading.current_thread() is threading.main_thread():
         signal.set_wakeup_fd(_pipe, warn_on_full_buffer=False)
@@ -124,10 +124,10 @@ class SignalState:
     """The state of deferred signals: whether a signal has arrived."""
 
     current: "SignalState | None" = None
-    """The state while signals are deferred, and after a signal has arrived."""
+    """The state while signals are deferred, and after a signal has arrived; else None."""
 
     def __init__(self, before: Mapping[Any, Any] | None = None) -> None:
-        """Start without a signal; `before` has the earlier handlers by signal."""
+        """Start without a signal; `before` has the earlier handlers by signal number."""
         self.number = 0
         """Number of the last signal; 0 for none."""
         self.has_work = False

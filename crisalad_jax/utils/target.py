@@ -33,7 +33,7 @@ class Target:
     """Whether a program may branch on values that it computes."""
 
     def product_dtype(self, dtype: Any) -> Any:
-        """Return the fastest output type for a product of matrices of `dtype`, before rounding.
+        """Return the fastest output type of a product of matrices of `dtype`, before it is rounded.
 
         A CPU uses its bfloat16 units only for products with float32 outputs. A GPU and a TPU round
         as they write, at no cost.
@@ -46,7 +46,7 @@ CPU, GPU, TPU = Target("cpu"), Target("gpu", cudnn=True), Target("tpu")
 PORTABLE = Target("portable")
 """No platform-dependent choices: a program runs on all platforms."""
 STRAIGHT = Target("portable", branches=False)
-"""No platform-dependent choices and no branches: a program of another format, for any engine."""
+"""No platform-dependent choices or branches: for programs in other formats, for any engine."""
 # JAX's trace cache depends on this: a function traced for one target is traced again for another.
 _chosen = jax.make_user_context(None)
 _mesh = jax.make_user_context(None)

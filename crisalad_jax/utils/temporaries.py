@@ -23,7 +23,7 @@ def holds_other_files(folder: pathlib.Path) -> bool:
 
 
 def temporary_beside(path: pathlib.Path) -> pathlib.Path:
-    """Return an unused temporary name in the folder of `path`, with its suffix."""
+    """Return an unused temporary name in the folder of `path`, with the same suffix."""
     return path.with_name(f".crisalad-{uuid.uuid4().hex[:12]}{path.suffix}")
 
 
@@ -75,7 +75,7 @@ def made_folder(folder: pathlib.Path) -> Iterator[None]:
     """Make a folder and its parents; if the block raises, remove those that are still empty.
 
     Raises:
-        InputError: they cannot be made.
+        InputError: the folder cannot be made.
     """
     new = [each for each in (folder, *folder.parents) if not each.exists()]
     _made[:0] = new

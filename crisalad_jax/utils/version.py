@@ -1,3 +1,3 @@
-"""The version of this package, which files record."""
+"""The version of this package, which its files record."""
 
 VERSION = "0.2.0"

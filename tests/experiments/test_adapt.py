@@ -31,7 +31,7 @@ from crisalad_jax.experiments.held_out import (
 )
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.extract import extract
-from crisalad_jax.retrieval.maps import remake
+from crisalad_jax.retrieval.maps import file_store, remake
 from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
@@ -321,6 +321,21 @@ def test_a_map_is_made_anew_with_all_that_it_had(placed, tmp_path) -> None:
     _, expected, _ = extract(OTHER, paths, tmp_path / "d.npy", reading=QUIET)
     # Half a unit of float16 in the last place, of numbers up to 1.
     np.testing.assert_allclose(found, expected, atol=2**-11)
+
+
+def test_an_open_map_never_searches_the_descriptors_of_a_remade_one(
+    placed, tmp_path, monkeypatch
+) -> None:
+    """In blocks, whose files are opened for each search, not in a single one held in memory."""
+    monkeypatch.setattr(file_store, "_BLOCK", 1)
+    weights = tmp_path / "other.safetensors"
+    save_weights(weights, OTHER)
+    with Map.open(placed, calibrated=False) as places:
+        query = np.eye(1, places.metadata.descriptor_length, dtype=np.float32)
+        places.search(query, 1, exact=True)
+        remake_map(placed, OTHER, weights=weights, reading=QUIET)
+        with pytest.raises(InputError, match="the map was replaced since it was opened"):
+            places.search(query, 1, exact=True)
 
 
 def test_a_map_stays_where_it_cannot_be_made_anew(placed, tmp_path, monkeypatch) -> None:

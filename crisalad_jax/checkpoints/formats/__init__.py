@@ -1,4 +1,4 @@
-"""Formats of public checkpoints: how each family's files name a model's parts."""
+"""Formats of public checkpoints: how the files of each model family name the arrays."""
 
 from crisalad_jax.checkpoints.formats.families import FORMATS as FORMATS
 from crisalad_jax.checkpoints.formats.families import REFERENCE as REFERENCE

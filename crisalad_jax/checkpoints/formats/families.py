@@ -1,4 +1,4 @@
-"""All formats of public checkpoints, by name: those of formats.toml, and what it cannot express.
+"""All formats of public checkpoints, by name: formats.toml, and code for what it cannot express.
 
 Names and shapes are those of each family's public code, and of the torch reference in `parity/`.
 """
@@ -31,7 +31,7 @@ from crisalad_jax.utils.pytree import named_leaves
 VOCABULARY = "anyloc-words"
 """Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023), with only the words."""
 REFERENCE = "reference"
-"""Name of the format of our torch reference."""
+"""Name of the format of this project's torch reference, which can hold any model."""
 
 
 def _with_squares(state: State, config: ModelConfig) -> ModelConfig:
@@ -110,20 +110,20 @@ class _Reference(Format):
 
 
 TABLES: dict[str, Rows] = read_tables({}, {})
-"""Tables of layers by name."""
+"""Tables of corresponding array names, by the name of the layer or part (see `rows.Row`)."""
 _CHAINS: dict[str, PreprocessingConfig] = {}
 _BACKBONES: dict[str, BackboneNames] = {}
 HEADS: dict[str, Head] = {}
-"""Heads by name; the reference format uses a head that is named like its aggregator."""
+"""Heads by name; the reference format uses the head with the same name as the aggregator."""
 FORMATS: dict[str, Format] = {}
-"""Formats by name, in the order in which they are tried on a state."""
+"""Formats by name, in the order in which they are tried on a checkpoint."""
 
 
 def add_formats(facts: Mapping[str, Any], source: str) -> None:
-    """Add all chains, tables, backbones, heads and formats of one file, or none of them.
+    """Register the chains, tables, backbones, heads and formats of parsed TOML: all, or none.
 
     Raises:
-        InputError: naming `source`, if a name is taken, or the content cannot be read.
+        InputError: naming `source`, the file, if a name is taken or `facts` cannot be read.
     """
     known = {"chains": _CHAINS, "tables": TABLES, "backbones": _BACKBONES, "heads": HEADS}
     known["formats"] = FORMATS

@@ -1,4 +1,4 @@
-"""A format of public checkpoints: its names for a model's parts, and how to infer the model."""
+"""A format of public checkpoints: its names for a model's arrays, and how to infer the model."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -19,11 +19,11 @@ class BackboneNames(NamedTuple):
     """How files name a backbone's parameters."""
 
     kinds: tuple[type[Backbone], ...]
-    """Classes of the backbones; empty for any backbone, which is in another file."""
+    """Classes of the backbones; empty if another file holds the backbone, which may be any."""
     rows: Rows
-    """Table of their names after the prefix, and ours after `backbone.`."""
+    """Table of names: the files' after `prefix`, this package's after `backbone.`."""
     marks: tuple[str, ...]
-    """Names of which every file with such a backbone has at least one."""
+    """Names after `prefix` of which every file with such a backbone has at least one."""
     prefix: str = ""
 
 
@@ -32,26 +32,26 @@ class Head(NamedTuple):
 
     kind: type[Aggregator]
     rows: Rows
-    """Table of their names after the prefix, and ours after `aggregator.`."""
+    """Table of names: the files' after `prefix`, this package's after `aggregator.`."""
     sizes: Mapping[str, str]
-    """Where files show each field of the configuration."""
+    """Where to read fields of the aggregator's configuration, as `Reader.read` takes it."""
     mark: str | None
-    """A name that every file with such a head has; None if the head has no parameters."""
+    """A name after `prefix` that every file with such a head has; None without parameters."""
     prefix: str
 
     def infer(self, state: State) -> Aggregator:
-        """Infer the configuration from names and shapes."""
+        """Infer the aggregator's configuration from the names and shapes in a checkpoint."""
         read = Reader(state, self.prefix)
         return self.kind(**{field: read.read(where) for field, where in self.sizes.items()})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Format:
-    """The names of a model's parts in the checkpoints of one family."""
+    """How the checkpoints of one model family name and order the arrays of a model."""
 
     name: str
     holds: str
-    """Description of the files."""
+    """Description of the files, for messages and lists."""
     backbone: BackboneNames
     head: Head
     image_size: tuple[int, int]
@@ -59,32 +59,32 @@ class Format:
     preprocessing: PreprocessingConfig
     encoder_rows: Rows
     projection: Row | None = None
-    """Row of the projection, with {dim} for its width; None without one."""
+    """Row of the projection layer, with {dim} for its width; None if there is no such layer."""
     head_first: int = 0
-    """Number of the head's rows that come before the backbone's."""
+    """How many of the head's rows come before those of the backbone in a file."""
     encoder_first: bool = False
-    """Whether the cross-image encoder comes before the head."""
+    """Whether the cross-image encoder comes before the head in a file."""
     adapter: str = "none"
     """Name of the adapter; "any" allows all."""
     encoder: str = "none"
-    """Name of the cross-image encoder; "any", or "none,NAME" if the file shows whether there is
-    one."""
+    """Name of the cross-image encoder; "any" allows all, and "none,NAME" means that the arrays show
+    whether there is one."""
     extras: Rows = ()
-    """Arrays that their files have and no descriptor needs."""
+    """Rows of arrays that the files have but no descriptor needs."""
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    """Fields that shapes do not show, by part."""
+    """Values of configuration fields that shapes do not show, by part and field."""
     adjust: Callable[[State, ModelConfig], ModelConfig] = lambda state, config: config
-    """Function that sets further fields from a state."""
+    """Function of a file's arrays and the inferred configuration that returns the final one."""
     inside: str = ""
-    """Key of the file's dictionary that holds the state, a slash, and a prefix of all names, as
-    torch's DataParallel adds it; empty if the file is the state."""
+    """Where a file holds its arrays: KEY of its dictionary, or KEY/PREFIX if all names have a
+    prefix, as torch's DataParallel adds it; empty if the file is the dictionary of arrays."""
     stored: Literal["torch", "safetensors"] = "torch"
-    """Kind of file."""
+    """Type of the file."""
     bare: bool = False
-    """Whether a file is a single tensor, which is a part of a model."""
+    """Whether a file is a single tensor, which is only a part of a model."""
 
     def parts(self) -> dict[str, list[str]]:
-        """Return the allowed names of each part of a model; "any" allows all."""
+        """Return the names that are allowed for each part of a model; "any" allows all."""
         return {
             "aggregator": [self.head.kind.part_name],
             "backbone": [kind.part_name for kind in self.backbone.kinds] or ["any"],
@@ -108,7 +108,7 @@ class Format:
             )
 
     def lines(self, config: ModelConfig, names: Iterable[str]) -> Iterator[Row]:
-        """Yield the table's rows for a model with these arrays, in the public order."""
+        """Yield the rows of a model whose arrays have these `names`, in the order of the files."""
         names, backbone, head = list(names), self.backbone_of(config), self.head_of(config)
         before, after = head.rows[: self.head_first], head.rows[self.head_first :]
         yield from expand(before, names, "aggregator.", head.prefix)
@@ -122,23 +122,23 @@ class Format:
             yield from expand((self.projection._replace(theirs=(theirs,)),), names)
 
     def backbone_of(self, config: ModelConfig) -> BackboneNames:
-        """Return the names of a model's backbone."""
+        """Return how the files name the backbone of a model with this configuration."""
         return self.backbone
 
     def head_of(self, config: ModelConfig) -> Head:
-        """Return the names of a model's aggregator."""
+        """Return how the files name the aggregator of a model with this configuration."""
         return self.head
 
     def has_backbone(self, state: State) -> bool:
-        """Return whether a state has the family's backbone, with or without a head."""
+        """Return whether `state`, a file's arrays by name, includes the family's backbone."""
         return any(self.backbone.prefix + mark in state for mark in self.backbone.marks)
 
     def has_head(self, state: State) -> bool:
-        """Return whether a state has the family's head; every state has one without parameters."""
+        """Return whether `state` includes the family's head; True for one without parameters."""
         return self.head.mark is None or self.head.prefix + self.head.mark in state
 
     def infer(self, state: State) -> ModelConfig:
-        """Infer the configuration of a state with backbone and head, from names and shapes."""
+        """Infer a model's configuration from the names and shapes of its arrays in a file."""
         backbone = self.backbone
         config = ModelConfig(
             image_size=self.image_size,
@@ -164,7 +164,7 @@ class Format:
 
 
 def parts_of(config: ModelConfig) -> dict[str, str]:
-    """Return the names of a model's parts, as in `Format.parts`."""
+    """Return the name of each part of a model, with the same keys as `Format.parts`."""
     backbone = config.backbone
     return {
         "aggregator": config.aggregator.part_name,

@@ -1,8 +1,8 @@
-"""Infer what a public checkpoint is, whatever wrappers training tools put around its names.
+"""Infer what a public checkpoint is, whatever prefixes training tools add to its names.
 
-torch.compile, DataParallel, FSDP and activation checkpointing wrap modules, each under its own
-name; Lightning has the network in a field `model`. The training code of facebookresearch/dinov2 and
-dinov3 saves its teacher with heads, or next to its student, and its blocks in chunks.
+torch.compile, DataParallel, FSDP and activation checkpointing each insert a name of their own, and
+Lightning puts the network in a field `model`. The training code of facebookresearch/dinov2 and
+dinov3 saves the teacher with its heads, or next to the student, and groups blocks into chunks.
 """
 
 import re
@@ -22,22 +22,22 @@ _HEADS = ("dino_head.", "ibot_head.")
 
 
 def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
-    """Return the format and the configuration that `identify` infers, and raise what it raises."""
+    """Infer only the format and the configuration; see `identify` for the arguments and errors."""
     return identify(state, source=source)[:2]
 
 
 def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
-    """Infer the format and the configuration of a state, from its names and shapes.
+    """Infer the format and configuration of `state`, a checkpoint's arrays by name.
 
-    Settings that shapes do not show are the published ones: heads of width 64 in the backbone, 16
-    heads in the encoder, alpha 0.2, three Sinkhorn iterations, the family's image size and resize.
-    Names of wrappers are removed; a warning counts other tensors that are left out.
+    Settings that shapes do not show are the published ones: heads of width 64 in most backbones, 16
+    heads in the encoder, adapters with alpha 0.2 (side adapters 0.5 or 1), three Sinkhorn
+    iterations, the family's image size and resize. A warning counts tensors that are left out.
 
     Returns:
-        (format, configuration, the arrays by the format's own names).
+        (name of the format, configuration, arrays by name without the prefixes of wrappers).
 
     Raises:
-        InputError: naming `source`, if the names fit no format or the widths no model.
+        InputError: naming `source`, the file, if the names fit no format or the sizes no model.
     """
     found: list[tuple[int, str, ModelConfig, str, State]] = []
     problems: list[str] = []
@@ -72,7 +72,7 @@ def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
 
 
 def renamed_to(state: State, names: Set[str]) -> State:
-    """Return the reading of a state, as in `_readings`, whose names are closest to `names`."""
+    """Return a state's arrays, stripped of wrappers and prefixes so as to fit `names` best."""
     return min((inside for _, inside in _readings(state)), key=lambda x: len(names ^ x.keys()))
 
 

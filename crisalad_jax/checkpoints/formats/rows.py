@@ -1,7 +1,7 @@
-"""Rows of tables: which arrays of a torch file match ours, and how their axes are permuted.
+"""Tables that match arrays of this package ("ours") with those of public files ("theirs").
 
-Forms only permute values, so gradients can be converted like weights, and a round trip gives the
-same bits. Biases of keys are an exception: no output depends on them, and some forms drop them.
+Forms only permute values, so gradients convert like weights, and a round trip gives the same bits.
+The exception is the bias of attention keys: no output depends on it, and some forms drop it.
 """
 
 import itertools
@@ -19,7 +19,7 @@ from crisalad_jax.nn.backbones.vgg import VggConfig
 
 
 class Form(NamedTuple):
-    """Two inverse functions between our arrays and theirs."""
+    """Two inverse functions: `ours` makes our arrays from those of a file, `theirs` the reverse."""
 
     ours: Callable[..., Sequence[np.ndarray]]
     theirs: Callable[..., Sequence[np.ndarray]]
@@ -30,23 +30,23 @@ FIRST = Form(lambda x: (x[0],), lambda x: (x[None],))
 
 
 class Extra(NamedTuple):
-    """An array of theirs that no model of ours uses, stored so that a round trip is exact."""
+    """An array of public files that no model here uses, stored so that a round trip is exact."""
 
     initial: Callable[[Any], np.ndarray]
-    """Function of the model's configuration that makes the array, if no file had it."""
+    """Function of the model's configuration that makes the array if no file provided it."""
     form: Form = SAME
     optional: bool = False
     """Whether files may lack it, so that it is written only if it was read."""
 
 
 class Absent(NamedTuple):
-    """An array of ours that no output needs and their files lack; it is filled when read."""
+    """An array of this package that public files lack; reading fills it with `value`."""
 
     value: float
 
 
 class Row(NamedTuple):
-    """Corresponding arrays, or layers whose arrays a table lists. "#" is a number, from 0."""
+    """Arrays, or layers with a table of arrays, that correspond; "#" stands for 0, 1, 2, ..."""
 
     ours: tuple[str, ...]
     theirs: tuple[str, ...]
@@ -54,11 +54,11 @@ class Row(NamedTuple):
 
 
 Rows = tuple[Row, ...]
-"""A table in the public order."""
+"""A table, whose rows are in the order of the arrays in public files."""
 
 
 def side(area: int) -> int:
-    """Return the side of a square grid."""
+    """Return the side of a square grid of `area` cells, rounded down."""
     return math.isqrt(area)
 
 
@@ -104,7 +104,7 @@ FORMS = {
     "pair-bias": Form(lambda a, b: (np.concatenate([a, b]),), lambda b: np.split(b, 2)),
     "scores": Form(lambda w: (w[:, :, 0].T,), lambda w: (w.T[:, :, None],)),
 }
-"""Forms of arrays by name."""
+"""Forms of single arrays, or of several that correspond to one, by name."""
 _LAYERS = {
     "norm": SAME,
     "linear": FORMS["transposed"],
@@ -171,17 +171,17 @@ EXTRAS = {
     "extra-pixels-weight": _zeros(lambda config: (_patch_numbers(config), config.aggregator.width)),
     "extra-pixels-bias": _zeros(lambda config: (_patch_numbers(config),)),
 }
-"""Arrays that files have and no descriptor needs, by name."""
+"""Arrays that public files have but no descriptor needs, by name."""
 ABSENT = {
     "absent-zero": Absent(0.0),
     "absent-one": Absent(1.0),
     "absent-exponent": Absent(START),
 }
-"""Arrays that files lack, by name."""
+"""Arrays that public files lack, by name."""
 
 
 def read_tables(texts: Mapping[str, str], known: Mapping[str, Rows]) -> dict[str, Rows]:
-    """Read tables; later ones may include rows of earlier ones."""
+    """Parse tables by name, which may include `known` and earlier ones; return all tables."""
     bias = Row(("bias",), ("bias",), SAME)
     tables: dict[str, Rows] = {
         name: (Row(("weight",), ("weight",), form), bias) for name, form in _LAYERS.items()
@@ -193,7 +193,7 @@ def read_tables(texts: Mapping[str, str], known: Mapping[str, Rows]) -> dict[str
 
 
 def read_table(text: str, tables: Mapping[str, Rows]) -> Rows:
-    """Read a table line by line; "+" means all rows of another table."""
+    """Parse a table of lines OURS THEIRS FORM; "+ PREFIX+ TABLE" includes another table's rows."""
     kinds = {**FORMS, **EXTRAS, **ABSENT, **tables}
     rows: list[Row] = []
     for line in filter(None, text.splitlines()):
@@ -222,9 +222,9 @@ def expand(rows: Rows, names: Iterable[str], ours: str = "", theirs: str = "") -
 
     Args:
         rows: the table.
-        names: the model's arrays; blocks are numbered.
-        ours: prefix of all our names in the table.
-        theirs: prefix of all their names in it.
+        names: names of the model's arrays, with numbered blocks.
+        ours: prefix to add to this package's names in the table.
+        theirs: prefix to add to the public files' names in the table.
     """
     parts = (itertools.accumulate(name.split("."), "{}.{}".format) for name in names)
     return _expand(rows, set(itertools.chain.from_iterable(parts)), ours, theirs)
@@ -244,7 +244,7 @@ def _expand(rows: Rows, known: set[str], ours: str, theirs: str) -> Iterator[Row
 
 
 def first_names(rows: Rows, ours: str = "", theirs: str = "") -> dict[str, str]:
-    """Map our names to theirs, taking the first of several; "#" is 0."""
+    """Map this package's names to public ones: the first pair of each row, with 0 for "#"."""
     named: dict[str, str] = {}
     for row in rows:
         here, there = (

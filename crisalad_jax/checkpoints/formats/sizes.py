@@ -36,16 +36,16 @@ _ENCODER_HEADS = 16
 
 
 class Reader(NamedTuple):
-    """A reader of the shapes of a state under a prefix, with one error for a missing name."""
+    """A reader of the shapes of a checkpoint's arrays, whose names all start with a prefix."""
 
     state: State
     prefix: str = ""
 
     def size(self, name: str, axis: int, default: int | None = None) -> int:
-        """Return the size of an axis, or the default if the name does not exist.
+        """Return the size of an array's axis, or `default` if there is no such array.
 
         Raises:
-            InputError: there is neither, or the array has no such axis.
+            InputError: there is neither; or the array has no such axis, or it is empty there.
         """
         if default is not None and not self.has(name):
             return default
@@ -63,12 +63,12 @@ class Reader(NamedTuple):
         return self.prefix + name in self.state
 
     def count(self, name: str) -> int:
-        """Count the consecutive numbers from 0 that follow a name."""
+        """Count the consecutive numbers from 0 that follow `name`, such as those of "blocks."."""
         heads = {key[: key.find(".", len(self.prefix + name))] for key in self.state}
         return next(i for i in range(len(heads) + 1) if f"{self.prefix}{name}{i}" not in heads)
 
     def read(self, where: str) -> int:
-        """Return the size at the place that a table of sizes gives; see formats.toml."""
+        """Read a size at "NAME AXIS" or "NAME AXIS?" (0 if absent), or the count at "NAME#"."""
         name, _, axis = where.partition(" ")
         if not axis:
             return self.count(name.removesuffix("#"))
@@ -76,10 +76,10 @@ class Reader(NamedTuple):
 
 
 def infer_backbone(kinds: tuple[type[Any], ...], rows: Rows, read: Reader) -> Backbone:
-    """Infer the configuration of a backbone, one of `kinds`, from names and shapes.
+    """Infer the configuration of a backbone, one of `kinds`, from the names and shapes in `read`.
 
     Raises:
-        InputError: it has sizes that no configuration has.
+        InputError: no configuration has the sizes found.
     """
     theirs = first_names(rows)
     if issubclass(kinds[0], VisionTransformer):
@@ -133,10 +133,10 @@ def _check_periods(read: Reader) -> int:
 
 
 def square_side(area: int, otherwise: str) -> int:
-    """Return the side of a square grid.
+    """Return the side of a square grid of `area` cells.
 
     Raises:
-        InputError: the area is not a square number; the message is `otherwise`.
+        InputError: the area is not a square number above 0; the message is `otherwise`.
     """
     length = math.isqrt(area)
     if length**2 != area or not length:
@@ -210,7 +210,7 @@ def _infer_tetra(read: Reader) -> TetraVitConfig:
 
 
 def infer_encoder(state: State, names: str) -> CrossImage:
-    """Infer the encoder and its sizes; the number of heads is the published one."""
+    """Infer the cross-image encoder, with the published number of heads; see `Format.encoder`."""
     read = Reader(state)
     layers = read.count("encoder.layers.")
     if not layers:

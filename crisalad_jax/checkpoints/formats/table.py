@@ -22,10 +22,10 @@ from crisalad_jax.utils.pytree import named_leaves
 
 
 def table(config: ModelConfig, name: str) -> list[Row]:
-    """Return a format's table for a model, in the public order, without the prefix `module.`.
+    """Return the rows for a model in the format `name`, without the prefix of `Format.inside`.
 
     Raises:
-        InputError: no such format, or the model has parts that it cannot hold.
+        InputError: there is no such format, or it cannot hold a part of the model.
     """
     form = choose("format", name, FORMATS)
     form.check_parts(config)
@@ -47,14 +47,14 @@ def _blank(config: ModelConfig) -> dict[str, np.ndarray]:
 
 
 def check_holds(config: ModelConfig, name: str) -> ModelConfig:
-    """Check that a model can be written in a format and read back as the same model.
+    """Check that a model can be written in the format `name` and read back as the same model.
 
     Returns:
-        The configuration that is inferred from its file; its non-semantic fields may differ.
+        The configuration inferred from such a file; fields such as the image size may differ.
 
     Raises:
-        InputError: what `table` raises; or a setting that shapes do not show differs from the
-            published one, which reading would return instead.
+        InputError: the format does not exist or cannot hold a part; or a setting that shapes do
+            not show differs from the published one, which reading would return instead.
     """
     state = _blank_state(config, name)
     if name in (REFERENCE, VOCABULARY):  # contain their configuration, or no model
@@ -85,10 +85,10 @@ def _shown(config: ModelConfig) -> ModelConfig:
 
 
 def public_shapes(config: ModelConfig, name: str) -> dict[str, tuple[int, ...]]:
-    """Return every name of a format with its shape, in the public order.
+    """Return the shape of every array of a model in the format `name`, by public name.
 
     Raises:
-        InputError: what `table` raises.
+        InputError: there is no such format, or it cannot hold a part of the model.
     """
     return {theirs: array.shape for theirs, array in _blank_state(config, name).items()}
 
@@ -100,13 +100,13 @@ def _blank_state(config: ModelConfig, name: str) -> dict[str, np.ndarray]:
 def to_params(
     state: State, config: ModelConfig, name: str, *, source: str
 ) -> tuple[Crisalad, dict[str, np.ndarray]]:
-    """Convert arrays by public name to (parameters, extras), as numpy arrays of the same types.
+    """Convert arrays of the format `name` to (parameters, extras), numpy arrays of the same types.
 
-    The extras are arrays of public checkpoints that no descriptor needs, and that a file may lack:
-    DINOv2's mask token, the batch norms' counts of batches, DINOv3's periods.
+    The extras are arrays of public checkpoints that no descriptor needs and that a file may lack:
+    DINOv2's mask token, the batch counts of batch norms, DINOv3's rotary periods.
 
     Raises:
-        InputError: naming `source` and the first names that are missing, unknown or misshaped.
+        InputError: naming `source`, the file, and the first names missing, unknown or misshaped.
     """
     lines, blank = table(config, name), _blank(config)
     shapes = {name: array.shape for name, array in _theirs(blank, lines, config, None).items()}
@@ -138,10 +138,10 @@ def to_params(
 def to_state(
     params: Crisalad, config: ModelConfig, name: str, extras: State
 ) -> dict[str, np.ndarray]:
-    """Invert `to_params`, in the public order; missing extras have their initial values.
+    """Return arrays by public name, the inverse of `to_params`; missing extras are initial values.
 
     Raises:
-        InputError: the format has no place for a part of this model.
+        InputError: the format cannot hold a part of this model.
     """
     leaves = {leaf: np.asarray(array) for leaf, array in named_leaves(params).items()}
     state = _theirs(leaves, table(config, name), config, extras)

@@ -1,4 +1,4 @@
-"""Walk through a traced program, and convert it equation by equation."""
+"""Walk through a traced program (a jaxpr), and convert it equation by equation."""
 
 import operator
 from collections.abc import Sequence
@@ -15,15 +15,15 @@ _CALLED = ("jaxpr", "call_jaxpr")
 
 
 def convert(graph: Graph, traced: Any, inputs: Sequence[Value]) -> list[Value]:
-    """Append the nodes of a program.
+    """Append the ONNX nodes of a traced program to a graph.
 
     Args:
         graph: the graph to append to.
         traced: the program, from `jax.make_jaxpr`.
-        inputs: its arguments, constants or not.
+        inputs: the program's arguments in order; some may be constants.
 
     Returns:
-        The outputs. Those that depend on an unsupported primitive name it in `Value.missing`.
+        The outputs. If one depends on an unsupported primitive, its `Value.missing` names that.
     """
     return _run(graph, traced.jaxpr, [Value.of(each) for each in traced.consts], inputs)
 

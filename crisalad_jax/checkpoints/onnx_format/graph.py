@@ -11,26 +11,26 @@ from onnx import helper
 from crisalad_jax.utils.version import VERSION
 
 OPSET = 17
-"""Version of the operators: all recent engines support it, TensorRT since 8.5."""
+"""Version of ONNX's operator set: all recent engines support it, TensorRT since 8.5."""
 _IR_VERSION = 8
 """Version of the file format that came with these operators."""
 Size = Any
-"""A side of an array: an integer, or JAX's expression in the symbolic number of images."""
+"""Size of an axis: an integer, or JAX's expression in the symbolic number of images."""
 Shape = tuple[Size, ...]
 
 
 def is_known(size: Size) -> bool:
-    """Return whether a side is a number, and not symbolic."""
+    """Return whether the size of an axis is a number rather than symbolic."""
     return isinstance(size, int | np.integer)
 
 
 def is_one(size: Size) -> bool:
-    """Return whether a side is 1, which a node broadcasts by itself."""
+    """Return whether the size of an axis is 1, so that a node broadcasts it by itself."""
     return is_known(size) and size == 1
 
 
 def common_shape(*shapes: Shape) -> Shape:
-    """Broadcast shapes as numpy does; their sides are known to fit."""
+    """Return the shape to which numpy would broadcast `shapes`, which must be compatible."""
     rank = max(map(len, shapes))
     padded = [(1,) * (rank - len(shape)) + tuple(shape) for shape in shapes]
     columns = zip(*padded, strict=True)
@@ -43,10 +43,10 @@ def _with_side(shape: Shape, axis: int, size: Size) -> Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Value:
-    """A constant, or an output of a node.
+    """An array of the program: a constant, or an output of a node.
 
-    It is broadcast lazily: a side of `shape` may be 1 where the array in JAX's program has a larger
-    one, along which all its rows are the same.
+    It is broadcast lazily: an axis of `shape` may have size 1 although it is longer in JAX's
+    program, if all values along it are the same.
     """
 
     shape: Shape
@@ -54,28 +54,28 @@ class Value:
     name: str = ""
     constant: np.ndarray | None = None
     missing: str = ""
-    """The unsupported operation whose result this would be; empty for a value that exists."""
+    """Name of the unsupported operation that the value depends on; empty if there is none."""
 
     @classmethod
     def of(cls, array: Any) -> "Value":
-        """Return a constant."""
+        """Return an array as a constant value."""
         array = np.asarray(array)
         return cls(array.shape, array.dtype, constant=array)
 
 
 class Graph:
-    """A graph under construction."""
+    """An ONNX graph under construction."""
 
     def __init__(self) -> None:
         """Start without nodes."""
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[str, np.ndarray] = {}
         self.symbolic: dict[Any, str] = {}
-        """Names of int64 vectors of one element, by the symbolic sides that they hold."""
+        """Names of one-element int64 vectors by the symbolic size that each holds."""
         self._names: dict[Any, str] = {}
 
     def constant(self, array: np.ndarray) -> str:
-        """Return the name of a constant; equal small ones share a name."""
+        """Add a constant array, and return its name; equal small arrays share a name."""
         small = array.nbytes <= 1024
         key = (str(array.dtype), array.shape, array.tobytes()) if small else id(array)
         if key not in self._names:
@@ -88,7 +88,7 @@ class Graph:
         return value.name if value.constant is None else self.constant(value.constant)
 
     def ints(self, *numbers: int) -> str:
-        """Return the name of a constant int64 vector, in which nodes take sides and axes."""
+        """Return the name of a constant int64 vector; nodes take sizes and axes in this form."""
         return self.constant(np.array(numbers, np.int64))
 
     def node(self, operator: str, inputs: Sequence[str], **attributes: Any) -> str:
@@ -100,12 +100,12 @@ class Graph:
     def add(
         self, operator: str, inputs: Sequence[Value | str], shape: Shape, dtype: Any, **fields: Any
     ) -> Value:
-        """Append a node with one output, and return the output."""
+        """Append a node with one output, and return the output as a `Value`."""
         names = [each if isinstance(each, str) else self.name(each) for each in inputs]
         return Value(tuple(shape), np.dtype(dtype), self.node(operator, names, **fields))
 
     def side(self, size: Size) -> str:
-        """Return the name of an int64 vector of one side's size, computed if it is symbolic."""
+        """Return the name of a one-element int64 vector with a size, computed if symbolic."""
         if is_known(size):
             return self.ints(int(size))
         if size not in self.symbolic:  # a multiple of one that exists
@@ -115,13 +115,13 @@ class Graph:
         return self.symbolic[size]
 
     def sides(self, shape: Shape) -> str:
-        """Return the name of an int64 vector of a shape's sizes."""
+        """Return the name of an int64 vector with the sizes of a shape."""
         if all(map(is_known, shape)):
             return self.ints(*map(int, shape))
         return self.node("Concat", [self.side(size) for size in shape], axis=0)
 
     def full(self, value: Value, shape: Shape, axes: Sequence[int] | None = None) -> Value:
-        """Broadcast a value to the full shape of its array, or along some axes."""
+        """Broadcast a value to `shape`, along all axes or only along `axes`."""
         axes = range(len(shape)) if axes is None else axes
         wanted = tuple(
             size if axis in axes else own
@@ -136,7 +136,7 @@ class Graph:
         return self.add("Expand", [value, self.sides(tuple(grown))], wanted, value.dtype)
 
     def reshape(self, value: Value, shape: Shape) -> Value:
-        """Reshape a value that is not broadcast along any side that changes."""
+        """Reshape a value that is not lazily broadcast along any axis that changes."""
         if tuple(value.shape) == tuple(shape):
             return value
         if value.constant is not None:
@@ -148,7 +148,7 @@ class Graph:
         return self.add("Reshape", [value, numbers], shape, value.dtype)
 
     def transpose(self, value: Value, axes: Sequence[int]) -> Value:
-        """Reorder axes."""
+        """Reorder the axes of a value, as `np.transpose` does."""
         if list(axes) == list(range(len(axes))):
             return value
         if value.constant is not None:
@@ -157,7 +157,7 @@ class Graph:
         return self.add("Transpose", [value], shape, value.dtype, perm=list(axes))
 
     def cast(self, value: Value, dtype: Any) -> Value:
-        """Convert to another type."""
+        """Convert a value to another type."""
         if value.dtype == np.dtype(dtype):
             return value
         if value.constant is not None:
@@ -165,7 +165,7 @@ class Graph:
         return self.add("Cast", [value], value.shape, dtype, to=tensor_type(dtype))
 
     def slice(self, value: Value, ranges: Mapping[int, tuple[int, int, int]]) -> Value:
-        """Slice some axes: start, end and step by axis."""
+        """Slice a value; `ranges` has (start, end, step) for each axis to slice."""
         ranges = {axis: cut for axis, cut in ranges.items() if cut != (0, value.shape[axis], 1)}
         if not ranges:
             return value
@@ -180,7 +180,7 @@ class Graph:
         return self.add("Slice", [value, *vectors], tuple(shape), value.dtype)
 
     def concatenate(self, values: Sequence[Value], axis: int) -> Value:
-        """Join values whose shapes differ only along the axis, where none is broadcast lazily."""
+        """Join values along an axis on which none is lazily broadcast; other axes are broadcast."""
         values = [value for value in values if value.shape[axis] != 0] or values[:1]
         shape = common_shape(*(_with_side(v.shape, axis, 1) for v in values))
         parts = [self.full(v, _with_side(shape, axis, v.shape[axis])) for v in values]
@@ -192,9 +192,9 @@ class Graph:
     def model(
         self, inputs: Sequence[Value], outputs: Sequence[tuple[str, Value]], words: str
     ) -> onnx.ModelProto:
-        """Return the program, with only the nodes that the outputs need.
+        """Return the ONNX model of the graph, with only the nodes that the named outputs need.
 
-        The arrays of constants are left out: `write_onnx` stores them in it or next to it.
+        `words` is the model's description. `write_onnx` adds the arrays of `constants`.
         """
         for name, value in outputs:
             self.nodes.append(helper.make_node("Identity", [self.name(value)], [name]))
@@ -222,7 +222,7 @@ class Graph:
 
 
 def tensor_type(dtype: Any) -> int:
-    """Return ONNX's number for a type."""
+    """Return the number that ONNX has for a numpy type."""
     return helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
 
 

@@ -21,7 +21,7 @@ from crisalad_jax.checkpoints.onnx_format.graph import (
 Converter = Callable[[Graph, Sequence[Value], Any], list[Value]]
 """A function that appends the nodes of a JAX equation to a graph, and returns the outputs."""
 CONVERTERS: dict[str, Converter] = {}
-"""Converters by primitive."""
+"""Converters by the name of their primitive."""
 
 
 class Unsupported(Exception):
@@ -29,7 +29,7 @@ class Unsupported(Exception):
 
 
 def converts(*names: str) -> Callable[[Converter], Converter]:
-    """Register a converter of primitives."""
+    """Return a decorator that registers a converter for primitives of these names."""
 
     def register(converter: Converter) -> Converter:
         CONVERTERS.update(dict.fromkeys(names, converter))
@@ -199,7 +199,7 @@ def _stack(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 
 
 def stacked(graph: Graph, values: Sequence[Value], axis: int) -> Value:
-    """Join values along a new axis."""
+    """Join values of one shape along a new axis, as `np.stack` does."""
     parts = [graph.reshape(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values]
     return graph.concatenate(parts, axis)
 

@@ -35,21 +35,21 @@ def write_onnx(
     The weights are constants of the program.
 
     Args:
-        path: the file.
-        run: the function, of a dictionary of arrays and the inputs in order.
-        weights: the arrays.
-        inputs: shapes and types of the inputs by name. Their first sides are the number of images,
-            which may be symbolic.
+        path: the .onnx file.
+        run: the function, whose arguments are `weights` and then the inputs in order.
+        weights: the weights by name.
+        inputs: shapes and types of the inputs by name. The first axis is that of the images, whose
+            number may be symbolic.
         output: name of the output.
         words: description to store in the file.
         external: whether large weights go to a separate file, `path` with .data appended.
 
     Returns:
-        Names of the nodes that multiply by weights.
+        Names of the nodes (matrix products and convolutions) that multiply by weights.
 
     Raises:
         InputError: the function has an operation that cannot be converted, which the message names;
-            or the disk is full.
+            or the file cannot be written.
     """
     traced: Any = jax.make_jaxpr(run)(weights, *inputs.values())
     graph = Graph()

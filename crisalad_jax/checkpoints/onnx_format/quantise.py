@@ -24,13 +24,13 @@ class _Images(quantization.CalibrationDataReader):
 def quantise(
     program: pathlib.Path, images: np.ndarray, nodes: Sequence[str], *, per_channel: bool
 ) -> None:
-    """Quantise a program that takes images, in place.
+    """Quantise to int8, in place, some products of a program that takes images.
 
     Args:
         program: the file in float32, for any number of images; its weights are next to it, with
             .data appended.
-        images: prepared images of the kind that will be described.
-        nodes: names of the products to quantise.
+        images: prepared images (image, height, width, 3) like those that will be described.
+        nodes: names of the nodes to quantise, which `write_onnx` returns.
         per_channel: whether each column of weights has its own scale, which is more accurate.
     """
     # The program finds its weights by file name, so the names stay the same.

@@ -14,7 +14,7 @@ Image = UInt8[np.ndarray, "h w 3"]
 class Augmentation(Part, abc.ABC):
     """A random change of training images: a frozen dataclass whose fields are its settings.
 
-    A plain function of (image, generator) is an augmentation without settings.
+    A plain function of (image, generator) can be registered as an augmentation without settings.
 
     Example:
         >>> from crisalad_jax import TrainConfig, register_augmentation
@@ -29,12 +29,12 @@ class Augmentation(Part, abc.ABC):
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Return the changed image, of the same size.
+        """Return the changed image, as 8-bit RGB of the same size.
 
         Args:
-            image: 8-bit RGB, of the model's size. Do not write to it; it may be returned.
-            generator: random numbers for this image only.
-            of_place: random numbers that all images of one place in a batch share.
+            image: 8-bit RGB of the model's image size. It is read-only, and may be returned as is.
+            generator: random generator for this image only.
+            of_place: random generator with the same draws for all images of a place in a batch.
         """
 
 
@@ -45,7 +45,7 @@ AUGMENTATIONS = Registry(
 
 @AUGMENTATIONS.register("none")
 class NoAugmentation(Augmentation):
-    """Leave images as they are."""
+    """No augmentation: images stay as they are."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator

@@ -15,30 +15,30 @@ _QUALITY = (12, 85)
 
 @AUGMENTATIONS.register("camera")
 class CameraAugmentConfig(LightAugmentConfig):
-    """The light augmentation, then the effects of a cheap camera, which rendered images lack."""
+    """The light augmentation with the effects of a cheap camera, which rendered images lack."""
 
     perspective: Fraction = 0.04
-    """Largest shift of a corner, as a share of the side."""
+    """Largest shift of an image's corner by a perspective warp, as a fraction of the side."""
     texture: NonNegativeFloat = 0.25
-    """Largest deviation of a multiplicative multi-scale texture, which rendered walls lack."""
+    """Largest relative strength of a random multi-scale texture, which rendered walls lack."""
     filters: Share = 0.3
-    """Probability of random filters over all colours, which change textures but not outlines (Xu
-    et al., ICLR 2021)."""
+    """Probability of blending the image with a randomly filtered copy, which changes textures but
+    not outlines (Xu et al., ICLR 2021)."""
     occlusion: Share = 0.3
-    """Probability that part of the image is covered."""
+    """Probability that a rectangle or ellipse covers part of the image."""
     motion: Share = 0.2
-    """Probability of motion blur, of up to a sixteenth of the width."""
+    """Probability of motion blur over up to a sixteenth of the width."""
     coarse: Share = 0.3
-    """Probability of a lower resolution, down to two fifths of each side."""
+    """Probability of shrinking the image, to two fifths of each side or more, and enlarging it."""
     noise: NonNegativeFloat = 8.0
-    """Largest standard deviation of noise, in grey levels."""
+    """Largest standard deviation of Gaussian noise, in grey levels from 0 to 255."""
     jpeg: Share = 0.4
-    """Probability of JPEG coding."""
+    """Probability of JPEG compression, at a random quality."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Mirror an image if its place is mirrored, change its light, and add camera effects."""
+        """Return the changed image; all images of a place in a batch are mirrored together."""
         if self.flip > 0 and of_place.random() < self.flip:
             image = cv2.flip(image, 1)
         if self.perspective > 0:

@@ -1,7 +1,7 @@
 """CosPlace's and EigenPlaces' augmentation: colour jitter, then a crop (Berton et al. 2022).
 
 It follows torchvision's `ColorJitter` and `RandomResizedCrop` on tensors from 0 to 1, and rounds to
-bytes at the end.
+8 bits at the end.
 """
 
 import math
@@ -35,14 +35,14 @@ class ColourCropConfig(Augmentation):
     saturation: NonNegativeFloat = 0.7
     """Largest relative change of saturation."""
     hue: Annotated[float, limited(0, 0.5)] = 0.5
-    """Largest turn of the hue; 1 is a full circle."""
+    """Largest shift of the hue, as a fraction of the colour circle."""
     crop: Fraction = 0.5
-    """Largest share of the area that a crop removes."""
+    """Largest fraction of the area that a crop removes."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Change the colours, then crop."""
+        """Return the image with changed colours, cropped and resized to its former size."""
         pixels = image.astype(np.float32) / 255
         strengths = [
             generator.uniform(max(0.0, 1 - each), 1 + each)

@@ -1,4 +1,4 @@
-"""A light augmentation, for training from scratch on fixed cameras."""
+"""The augmentation "light", for training from scratch on images of fixed cameras."""
 
 import math
 
@@ -14,12 +14,12 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 
 @AUGMENTATIONS.register("light")
 class LightAugmentConfig(Augmentation):
-    """One small warp and mild changes of light, for training from scratch on fixed cameras."""
+    """A small warp and mild changes of light, for training from scratch on fixed cameras."""
 
     crop: Fraction = 0.1
-    """Largest share of the side that a crop removes."""
+    """Largest fraction of each side that a crop removes."""
     shift: Fraction = 0.05
-    """Largest shift, as a share of the side."""
+    """Largest shift, as a fraction of the side."""
     rotation: NonNegativeFloat = 2.0
     """Largest rotation in degrees."""
     flip: Share = 0.0
@@ -29,24 +29,24 @@ class LightAugmentConfig(Augmentation):
     colour: Fraction = 0.2
     """Largest relative change of brightness, of contrast and of saturation."""
     grey: Share = 0.2
-    """Probability of dropping the colour."""
+    """Probability of turning the image grey."""
     gamma: NonNegativeFloat = 0.0
-    """Largest change of log gamma, the exponent of intensities."""
+    """Largest change of the logarithm of gamma, the exponent of pixel intensities."""
     illumination: NonNegativeFloat = 0.0
-    """Largest change of log brightness in a smooth field over the image: uneven light."""
+    """Largest change of log brightness by a smooth random field that imitates uneven light."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Mirror an image if its place is mirrored, then change its light."""
+        """Return the changed image; all images of a place in a batch are mirrored together."""
         if self.flip > 0 and of_place.random() < self.flip:
             image = cv2.flip(image, 1)
         return self.change_light(image, generator)
 
     def change_light(self, image: Image, generator: np.random.Generator) -> Image:
-        """Warp and blur an image a little, and change its light, contrast and colour.
+        """Return a slightly warped and blurred image with changed light, contrast and colour.
 
-        Every call draws the same number of random values, whatever the fields.
+        Every call draws the same number of random values, whatever the settings.
         """
         height, width = image.shape[:2]
         scale = generator.uniform(1 - self.crop, 1)

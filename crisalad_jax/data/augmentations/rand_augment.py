@@ -25,16 +25,16 @@ class RandAugmentConfig(Augmentation):
     """RandAugment (Cubuk et al. 2020): torchvision's 14 operations, with GSV-Cities' strength."""
 
     operations: NonNegativeInt = 3
+    """Number of operations applied to each image."""
     magnitude: Annotated[int, limited(0, MAGNITUDE_BINS - 1)] = 9
-    """Strength, one of 31 bins."""
+    """Strength of the operations, from 0 to 30: torchvision's 31 bins."""
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
         """Apply some of `OPERATIONS`, drawn uniformly with replacement, with random signs.
 
-        The result is that of torchvision's RandAugment on Pillow images, with bilinear
-        interpolation and black fill. Images must already have the model's size.
+        The result is that of torchvision's RandAugment on Pillow images, bilinear with black fill.
         """
         names = list(OPERATIONS)
         for number in generator.integers(len(names), size=self.operations):
@@ -170,11 +170,11 @@ def _blend(
 
 
 class Operation(NamedTuple):
-    """One operation of RandAugment."""
+    """An operation: `apply(image, strength)`; if `signed`, the sign of the strength is random."""
 
     apply: Callable[[Image, float], Image]
     strength: Callable[[float, int, int], float]
-    """Strength from magnitude (as a fraction of its largest), height and width."""
+    """Strength as a function of the magnitude (from 0 to 1) and the image's height and width."""
     signed: bool
 
 
@@ -198,4 +198,4 @@ OPERATIONS: dict[str, Operation] = {
     "AutoContrast": Operation(_autocontrast, _scaled(0), signed=False),
     "Equalize": Operation(_equalize, _scaled(0), signed=False),
 }
-"""The 14 operations by torchvision's names."""
+"""The 14 operations of RandAugment by torchvision's names."""

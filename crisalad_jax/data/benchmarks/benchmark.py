@@ -20,30 +20,30 @@ from crisalad_jax.utils.shapes import Bool, Float64, Int64
 @brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class Benchmark:
-    """One evaluation set, in the order in which its images are described."""
+    """An evaluation set: its images, ground truth and, if known, positions."""
 
     name: str
-    """Name that identifies the images read, such as "sped_val/test (@UTM, 25 m)"."""
+    """Name of the set and how it was read, such as "sped_val/test (@UTM, 25 m)"."""
     root: pathlib.Path
     database: tuple[pathlib.Path, ...]
     queries: tuple[pathlib.Path, ...]
     positives: tuple[Int64[np.ndarray, " _"], ...] | None
-    """Database indices for each query, ascending; empty if it has no match, which counts as a miss.
-    None if the set has no ground truth at all."""
+    """For each query, the ascending indices of its correct database images; empty if there are
+    none, which counts as a miss. None if the set has no ground truth at all."""
     rule: str
     """Description of the rule that makes a database image a positive."""
     database_positions: Float64[np.ndarray, "database axis"] | None = None
-    """East and north in metres; if a set is wider than one UTM zone, points on the ellipsoid
-    (`metres.on_ellipsoid`). None if there are none or only placeholders."""
+    """UTM east and north in metres, or `metres.on_ellipsoid` if zones differ; None if unknown."""
     query_positions: Float64[np.ndarray, "q axis"] | None = None
+    """The same for the queries. Both are None for placeholder coordinates."""
     radius: float = 25.0
-    """Metres within which two positions show the same place."""
+    """Distance in metres up to which two positions count as the same place."""
 
     def ground_truth(self) -> tuple[Int64[np.ndarray, " _"], ...]:
         """Return `positives`, or raise if the set has no ground truth.
 
         Raises:
-            InputError: the set has none.
+            InputError: the set has no ground truth.
         """
         if self.positives is None:
             raise InputError(
@@ -56,14 +56,14 @@ class Benchmark:
     ) -> "Benchmark":
         """Return the set without the images that are marked as unreadable.
 
-        Queries retain their readable positives. One without any counts as a miss, as in other sets.
+        Queries retain their readable positives. A query that has none counts as a miss.
 
         Args:
             queries: whether each query could be read.
             database: whether each database image could be read.
 
         Raises:
-            InputError: none of the queries, or of the database, could be read.
+            InputError: none of the queries, or none of the database images, could be read.
         """
         if queries.all() and database.all():
             return self
@@ -94,7 +94,7 @@ def leave_out_unreadable(benchmark: Benchmark, *, quiet: bool = False) -> Benchm
         quiet: whether to hide the progress bar.
 
     Raises:
-        InputError: what `Benchmark.of_readable` raises.
+        InputError: none of the queries, or none of the database images, can be read.
     """
     readable = readable_images((*benchmark.queries, *benchmark.database), quiet=quiet)
     return benchmark.of_readable(*np.split(readable, [len(benchmark.queries)]))
@@ -103,7 +103,7 @@ def leave_out_unreadable(benchmark: Benchmark, *, quiet: bool = False) -> Benchm
 def readable_images(
     paths: Sequence[pathlib.Path], *, quiet: bool = False
 ) -> Bool[np.ndarray, " images"]:
-    """Decode images, and return which of them can be read."""
+    """Decode images, and return which of them can be read, in the order of `paths`."""
     readable = np.empty(len(paths), bool)
     with (
         progress_bar("reading", len(paths), "images", quiet=quiet) as bar,
@@ -123,7 +123,7 @@ def _is_readable(path: pathlib.Path) -> bool:
 
 
 DEFAULT_RADIUS = 25.0
-"""Radius in metres of the common rule (Arandjelovic et al. 2016)."""
+"""Default radius of positives in metres, as in Arandjelovic et al. (2016)."""
 
 
 def within(
@@ -131,7 +131,7 @@ def within(
     queries: Float64[np.ndarray, "q axis"],
     radius: float,
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
-    """Find the database images at most `radius` away from each query, as ascending indices.
+    """Return the ascending indices of the database points at most `radius` from each query point.
 
     Raises:
         InputError: the radius is negative, infinite or not a number.

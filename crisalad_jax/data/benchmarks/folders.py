@@ -1,4 +1,4 @@
-"""Two plain folders, `database/` and `queries/`, with tables of matches or positions, or none."""
+"""Read the folders `database/` and `queries/`, and a table of matches or positions if any."""
 
 import os
 import pathlib
@@ -28,32 +28,32 @@ def read_folders(
     *,
     frames: int | None = None,
 ) -> Benchmark:
-    """Read `database/` and `queries/`, whose images may have any names.
+    """Read an evaluation set from `database/` and `queries/`, whose images may have any names.
 
-    The ground truth is `ground_truth.csv` in the same folder, or `frames`, or a table of positions;
-    or there is none. The table of matches has lines of `query,database`, with paths relative to
-    the two folders: one line for each match of a query, or the line `query,` for a query without a
-    match. Every query has a line.
+    The ground truth comes from `ground_truth.csv` next to the two folders, from `frames`, or from
+    positions; without these there is none. `ground_truth.csv` has lines `query,database`, with
+    paths relative to the two folders: one line for each match of a query, or the line `query,` for
+    a query without a match. Every query has a line.
 
     Positions are in `positions.csv`, which names images by their path, such as `database/1.jpg`; or
     in `database.csv` and `queries.csv`, which name them by their path in these folders. The columns
-    are `name,east,north` or `name,lat,lon`; degrees are projected to UTM if all are in one zone,
-    else they become points on the ellipsoid (`metres.comparable`).
+    are `name,east,north`, `name,lat,lon` or `name,x,y`. Degrees are projected to UTM if all are in
+    one zone, else they become points on the ellipsoid (`metres.comparable`).
 
     Args:
-        root: the folder that holds the two, or one whose `images/{test,val,train}` do.
-        split: None takes `test`, else `val`.
+        root: the folder that holds the two folders, or that has them in `images/{test,val,train}`.
+        split: the folder in `images/`; None takes `test` or, if there is no `test`, `val`.
         radius: if positions are the ground truth, metres within which an image is a positive,
             inclusive; None is 25.
-        frames: the i-th query matches the database images i - frames to i + frames, for two folders
-            with frames of the same moments. Frames are sorted by the numbers in their names, so
-            that frame 10 follows frame 9.
+        frames: the i-th query matches the database images i - frames to i + frames, for two drives
+            whose i-th frames show the same place. Frames are sorted by the numbers in their names,
+            so that frame 10 follows frame 9.
 
     Raises:
-        InputError: a folder is missing or without images; a table names an image that does not
-            exist, leaves one out, or contradicts itself; a negative number of frames, folders of
-            different counts, `frames` with a table, a radius without positions to measure, one
-            side's table of positions without the other's, or what `read_image_table` raises.
+        InputError: a folder is missing or without images; a table is not valid, names an image that
+            does not exist, leaves one out, or contradicts itself; two of `ground_truth.csv`,
+            `frames` and `radius` are given; `frames` is negative, or the folders then differ in
+            their number of images; a radius without positions; or only one side has positions.
     """
     root = pathlib.Path(root)
     folder, name = find_split(root, split)

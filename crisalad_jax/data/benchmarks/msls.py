@@ -1,8 +1,8 @@
-"""Mapillary Street-Level Sequences as published (Warburg et al., CVPR 2020).
+"""Read Mapillary Street-Level Sequences (MSLS) as published (Warburg et al., CVPR 2020).
 
-`train_val/{city}/{query,database}/` with `images/KEY.jpg` and tables whose rows are in the same
-order: `raw.csv` (key, lon, lat, ca, captured_at, pano), `postprocessed.csv` (key, easting,
-northing, ...) and `subtask_index.csv` (all, ...). `ca` is the compass angle in degrees.
+Each `train_val/{city}/{query,database}/` has `images/KEY.jpg`, and tables with the same row order:
+`raw.csv` (key, lon, lat, ca, captured_at, pano), `postprocessed.csv` (key, easting, northing, ...)
+and `subtask_index.csv` (all, ...). `ca` is the compass angle in degrees.
 """
 
 import os
@@ -31,11 +31,11 @@ MSLS_CITIES = {
         *("phoenix", "saopaulo", "tokyo", "toronto", "trondheim", "zurich"),
     ),
 }
-"""The cities whose positions are published."""
+"""The cities whose positions are published, by split."""
 
 
 def msls_title(cities: Collection[str]) -> str:
-    """Name a set of these cities: "MSLS val", "MSLS train", or MSLS and the cities' names."""
+    """Return a title for these cities: "MSLS val", "MSLS train", or "MSLS of" and their names."""
     for split, expected in MSLS_CITIES.items():
         if set(cities) == set(expected):
             return f"MSLS {split}"
@@ -51,14 +51,14 @@ def read_msls(
     subtask: bool = False,
     on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
-    """Read raw MSLS: all images except panoramas. A query without a match counts as a miss.
+    """Read MSLS as published: all images except panoramas.
 
-    VPR-datasets-downloader uses the same images: about 11,000 queries of val.
+    A query without a match counts as a miss. VPR-datasets-downloader uses the same images: about
+    11,000 queries of val.
 
-    With `subtask`, read what the official code reads for val, with its list of 740 queries: images
-    that `subtask_index.csv` marks as `all`. Queries need a database image within `radius`, by
-    distance only; a `max_heading_difference` does not change the queries, and those that it leaves
-    without a match count as misses.
+    With `subtask`, the set is that of the official code, which has 740 queries in val: images that
+    `subtask_index.csv` marks as `all`, and only queries with a database image within `radius`. A
+    query that then has no match because of `max_heading_difference` stays, and counts as a miss.
 
     Args:
         root: the folder with `train_val/`, or `train_val/` itself.
@@ -67,12 +67,12 @@ def read_msls(
         max_heading_difference: largest difference of two compass angles in degrees, inclusive, for
             a match (the CriSALAD paper says 40); None allows any, as the official code does.
         subtask: whether to read only the subtask `all`.
-        on_bad_image: "skip" allows missing images, to be left out when they are read.
+        on_bad_image: "stop" refuses missing images; under "skip" `evaluate` leaves them out.
 
     Raises:
-        InputError: no such city; a table that is missing, lacks a column or has another length; a
-            field that is not a number; missing images; a negative radius; or an angle that is not
-            from 0 to 180.
+        InputError: no such split, or none of its cities; a table that is missing, lacks a column or
+            differs from the others in its rows; a field that is not a number; missing images; no
+            query to evaluate; a negative radius; or an angle that is not from 0 to 180.
     """
     root, limit = pathlib.Path(root), max_heading_difference
     if limit is not None and not 0 <= limit <= 180:
@@ -116,7 +116,7 @@ def read_msls(
 
 
 def city_folders(root: pathlib.Path, cities: Collection[str]) -> list[pathlib.Path]:
-    """Find the folders of these cities; raise InputError if none exists."""
+    """Return the existing folders of these cities; raise InputError if there are none."""
     parent = root / "train_val" if (root / "train_val").is_dir() else root
     folders = [parent / city for city in cities if (parent / city).is_dir()]
     if not folders:
@@ -150,7 +150,7 @@ def _positions(sides: list[_Side]) -> Float64[np.ndarray, "images axis"]:
 
 
 def is_msls(root: pathlib.Path) -> bool:
-    """Return whether a folder is raw MSLS: it holds train_val/ or is itself train_val/."""
+    """Return whether a folder is MSLS as published: it holds train_val/, or is train_val/."""
     return is_folder(root / "train_val") or real_path(root).name == "train_val"
 
 
@@ -162,7 +162,7 @@ def read_side(
     subtask: bool = False,
     clusters: bool = False,
 ) -> _Side:
-    """Read a folder's images that are not panoramas, in the order of the tables."""
+    """Read the database or the queries of a city without panoramas, in the order of the tables."""
     columns = ("lat", "lon", *["ca"] * headings)
     raw = list(read_table(folder / "raw.csv", "key", "pano", *columns).rows())
     needed = ("key", "easting", "northing", *["unique_cluster"] * clusters)

@@ -1,7 +1,7 @@
-"""NetVLAD's `.mat` files (Arandjelovic et al., CVPR 2016): Pitts30k, Pitts250k, Tokyo.
+"""Read NetVLAD's `.mat` files (Arandjelovic et al., CVPR 2016): Pitts30k, Pitts250k, Tokyo.
 
 Each holds a struct `dbStruct` with whichSet, dbImage, utmDb (2 x N), qImage, utmQ, numDb, numQ,
-posDistThr, and other fields that are not needed here.
+posDistThr (the radius of positives in metres), and other fields that are not needed here.
 """
 
 import os
@@ -31,15 +31,14 @@ def read_netvlad(
     images: str | os.PathLike[str] | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
-    """Read a `.mat` file of NetVLAD; a positive is at most `radius` metres away.
+    """Read an evaluation set from one of NetVLAD's `.mat` files.
 
     Args:
         path: the file, such as `pitts30k_test.mat`.
         radius: radius of positives in metres, inclusive; None takes the file's posDistThr.
         images: the folder with `000/...` (or `images/000/...`) and with the queries in
-            `queries_real/`, `queries/` or `query/`; None looks in the file's folder and the one
-            above.
-        on_bad_image: "skip" allows missing images, to be left out when they are read.
+            `queries_real/`, `queries/` or `query/`; None tries the file's folder, then its parent.
+        on_bad_image: "stop" refuses missing images; under "skip" `evaluate` leaves them out.
 
     Raises:
         InputError: no such file, no dbStruct in it, counts that differ from its arrays, missing

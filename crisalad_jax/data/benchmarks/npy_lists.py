@@ -1,10 +1,10 @@
-"""Sets whose ground truth is in `.npy` files: VPR-Bench's folders, GSV-Cities' and SALAD's lists.
+"""Read sets with `.npy` ground truth: VPR-Bench's folders, GSV-Cities' and SALAD's lists.
 
-VPR-Bench (Zaffar et al., IJCV 2021): `ref/`, `query/`, `ground_truth_new.npy`.
+VPR-Bench (Zaffar et al., IJCV 2021) has `ref/`, `query/` and `ground_truth_new.npy`.
 
-The lists: `pitts30k_test_dbImages.npy`, `..._qImages.npy` and `..._gt.npy`. MSLS has
-`..._qIdx.npy` (indices of the evaluated queries) and `..._pIdx.npy` (their matches) instead of
-`gt`.
+The lists of a set are `pitts30k_test_dbImages.npy` and `..._qImages.npy` (names of images) and
+`..._gt.npy` (matches of each query). Instead of the latter, MSLS has `..._qIdx.npy` (indices of the
+evaluated queries) and `..._pIdx.npy` (their matches).
 
 Published ground truths are arrays of lists, which numpy can only save as a pickle. They are read
 without running code from them.
@@ -44,14 +44,14 @@ _Lists = dict[str, pathlib.Path]
 
 
 def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
-    """Read a VPR-Bench folder: `ref/`, `query/`, `ground_truth_new.npy`.
+    """Read a VPR-Bench folder `root`, with `ref/`, `query/` and `ground_truth_new.npy`.
 
     The file holds one row for each query: its index and a list of reference indices, [-1] where
-    there is no match. An index is a position among the images in the order of their numbers. No
-    code in the file is run.
+    there is no match. Indices count the images from 0, in the order of the numbers in their names.
+    No code in the file is run.
 
-    The published lists of GardensPointWalking and 17places are windows of frames, and the last ones
-    extend past the last image. References past it are left out, and a warning counts them.
+    The published lists of GardensPointWalking and 17places are windows of frames, which may extend
+    past the last image. References past it are left out, and a warning counts them.
 
     Raises:
         InputError: a folder or the file is missing, a number is skipped among the images' names,
@@ -99,10 +99,10 @@ def read_salad_lists(
 
     Args:
         root: a folder with such lists, or one of the files.
-        split: part of a set's name, such as `val`, where the folder has the lists of several sets.
-        images: the folder to which the names are relative; None looks in the folder of the files
-            and the one above.
-        on_bad_image: "skip" allows missing images, to be left out when they are read.
+        split: part of a set's name between underscores, such as `val`, if the folder has several.
+        images: the folder to which the names are relative; None tries the folder of the files, then
+            its parent.
+        on_bad_image: "stop" refuses missing images; under "skip" `evaluate` leaves them out.
 
     Raises:
         InputError: not the lists of exactly one set, a file that holds anything but names or
@@ -141,7 +141,7 @@ def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
     """Find the lists of each set in a folder, or of the set that a file belongs to.
 
     Returns:
-        The files by the prefix of their names. Sets without a database or queries are left out.
+        For each set with database and queries, by its files' prefix: the files by kind ("gt", ...).
     """
     one = _FILE.fullmatch(root.name) if root.is_file() else None
     sets: dict[str, _Lists] = collections.defaultdict(dict)
@@ -269,7 +269,7 @@ the file, calls back into it, or can be changed by it."""
 
 
 def read_npy(path: pathlib.Path) -> np.ndarray:
-    """Read a .npy file; a pickled one may hold lists, tuples, text, bytes, numbers and arrays.
+    """Read a .npy file; a pickle in it may hold lists, tuples, text, bytes, numbers and arrays.
 
     Raises:
         InputError: the file is missing, damaged, or holds anything else.

@@ -1,4 +1,4 @@
-"""Find folders, splits and images on disk, for several readers."""
+"""Find folders, splits and images of evaluation sets on disk."""
 
 import os
 import pathlib
@@ -14,19 +14,19 @@ SPLITS = ("test", "val", "train")
 
 
 def find_database(folder: pathlib.Path) -> pathlib.Path:
-    """Return the folder `database/`, or `gallery/` (SVOX) if there is none."""
+    """Return the path of `database/` in a folder, or of `gallery/` (SVOX) if only that exists."""
     gallery = folder / "gallery"
     database = folder / "database"
     return gallery if is_folder(gallery) and not is_folder(database) else database
 
 
 def has_sides(folder: pathlib.Path) -> bool:
-    """Return whether a folder itself holds a database and queries."""
+    """Return whether a folder itself holds `database/` (or `gallery/`) and `queries/`."""
     return is_folder(find_database(folder)) and is_folder(folder / "queries")
 
 
 def list_part(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
-    """List the images under a folder, in sorted order.
+    """List the images under a folder and its subfolders, sorted by path.
 
     Raises:
         InputError: there is no such folder (the message lists its siblings), or no image in it.
@@ -45,7 +45,7 @@ def listing(folder: pathlib.Path) -> str:
 
 
 def shown(names: Iterable[str]) -> str:
-    """Join the first few of many names for a message."""
+    """Join the first eight names for a message, and count the others."""
     ordered = sorted(names)
     some = ", ".join(ordered[:8]) or "nothing"
     return f"{some} and {len(ordered) - 8} more" if len(ordered) > 8 else some
@@ -57,13 +57,13 @@ def has_split(root: pathlib.Path) -> bool:
 
 
 def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str]:
-    """Find the folder that holds database/ and queries/, and its name.
+    """Return the folder that holds database/ and queries/, and a name such as "pitts30k/test".
 
-    The folder is `root` itself or one of `images/{test,val,train}`. Without `split` it is the first
-    of test and val that exists.
+    The folder is `root/images/{split}`. Without `split`, it is `root` itself or, if that does not
+    hold them, the first of test and val that exists.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such folder.
     """
     # Resolved, so that a root of "." has a name to print too.
     resolved = real_path(root)
@@ -88,18 +88,18 @@ def find_images(
     on_bad_image: OnBadImage,
     folders: Sequence[str] = (".",),
 ) -> tuple[pathlib.Path, ...]:
-    """Return the paths of all images that a file names; see `tables.Disk`.
+    """Return the paths of the images that a file names, in its order; `tables.Disk` finds them.
 
     Args:
-        named_by: the file.
-        names: the images' names.
-        images: the folder that holds them; None looks in that of the file, and the one above.
-        on_bad_image: under "skip" some may be missing, to be left out when they are read.
-        folders: folders in it that names may be relative to; the first that has any of the images
-            is used.
+        named_by: the file, such as a list or a table.
+        names: the names of the images in the file.
+        images: the folder of the images; None tries the file's folder, then its parent.
+        on_bad_image: "stop" refuses missing images; "skip" returns paths for them, too.
+        folders: subfolders of `images` that names may be relative to; the first that has any of the
+            images is used.
 
     Raises:
-        InputError: some are missing; the message counts them and names the first.
+        InputError: images are missing, under "skip" all; the message names the first.
     """
     near = (named_by.parent, named_by.parent.absolute().parent)
     tops = near if images is None else (pathlib.Path(images),)

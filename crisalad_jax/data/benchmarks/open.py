@@ -32,7 +32,7 @@ LAYOUTS: dict[str, Callable[..., Benchmark]] = {
     "msls-subtask": functools.partial(read_msls, subtask=True),
     "folders": read_folders,
 }
-"""Reader of each layout. It takes a path, then some of `open_benchmark`'s options by name."""
+"""Readers of evaluation sets, by layout; each takes some of the options of `open_benchmark`."""
 
 
 @takes(root=PATH)
@@ -55,24 +55,24 @@ def open_benchmark(
     `read_vpr_bench`, `read_netvlad`, `read_salad_lists`, `read_msls` or `read_folders`.
 
     Args:
-        root: a folder, or one of NetVLAD's or SALAD's files.
-        split: test, val or train.
-        radius: largest distance of a positive in metres.
-        images: the folder of the images that a file names.
-        max_heading_difference: largest difference of headings of a positive in degrees.
-        frames: largest number of frames between a query and a positive.
-        queries: the folder of the queries, if there are several.
+        root: a folder, a NetVLAD `.mat` file, or one of SALAD's `.npy` lists.
+        split: "test", "val" or "train".
+        radius: largest distance of a positive from its query in metres, inclusive.
+        images: folder of the images, for layouts in which a file names them.
+        max_heading_difference: largest angle between the headings of a query and a positive, in
+            degrees.
+        frames: largest difference between the frame numbers of a query and a positive.
+        queries: name of the folder of the queries, if there are several.
         ignore_zones: whether to compare @UTM coordinates of all zones as if in one plane.
-        layout: one of `LAYOUTS`; `msls-subtask` is never detected from the files.
-        on_bad_image: "stop" if an image that a file names is missing; under "skip" it stays in the
-            set, and `evaluate` leaves it out.
+        layout: a name in `LAYOUTS`, such as "utm"; "msls-subtask" is never detected.
+        on_bad_image: "stop" refuses missing images; under "skip" `evaluate` leaves them out.
 
     Returns:
         The set: queries, database, positions and ground truth.
 
     Raises:
-        InputError: no known layout, an option that the layout does not have, or what its reader
-            raises.
+        InputError: no known layout, an option that the layout does not have, or a set that its
+            reader refuses, for example because files are missing.
 
     Example:
         >>> import shutil

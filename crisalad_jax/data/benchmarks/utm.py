@@ -21,7 +21,7 @@ from crisalad_jax.utils.output import counted
 from crisalad_jax.utils.shapes import Float64, Int64
 
 QUERIES = "queries"
-"""Default folder of the queries."""
+"""Default name of the folder of the queries."""
 _PLACE_METRES = 1000.0
 _PAIRED = {607: "SPED", 1231: "AmsterTime"}
 """Sets whose places have one image on each side, and no coordinates, by their number of places."""
@@ -44,24 +44,24 @@ def read_utm(
     queries: str = QUERIES,
     ignore_zones: bool = False,
 ) -> Benchmark:
-    """Read `@UTM_east@UTM_north@zone@letter@...` images; a positive is at most `radius` m away.
+    """Read images named `@UTM_east@UTM_north@zone@letter@...`; positives are within `radius`.
 
-    Distances between images of one zone and hemisphere are in its plane; other distances are on
-    the ground.
+    Distances between images of one UTM zone and hemisphere are those in the zone's plane; other
+    distances are on the ground.
 
     VPR-datasets-downloader writes placeholder coordinates for Nordland (easting 0, frames
-    a few metres apart), SPED and AmsterTime (easting 0, places 1 km apart). The benchmark's name
-    and rule then say what they stand for. MSLS is recognised by the notes in the file names.
+    a few metres apart), SPED and AmsterTime (easting 0, places 1 km apart). The name and the rule
+    of the result then say what they stand for. MSLS is recognised by the notes in the file names.
 
     Args:
         root: a folder with `images/{test,val,train}`, or one that itself holds `database/` and
             `queries/`; SVOX's database is in `gallery/`.
-        split: None takes `test`, else `val`.
+        split: the folder in `images/`; None takes `test` or, if there is no `test`, `val`.
         radius: radius of positives in metres, inclusive.
-        queries: the folder of the queries: SVOX has `queries`, `queries_night` and others. The
-            benchmark's name says which, unless it is `queries`.
+        queries: name of the folder of the queries: SVOX has `queries`, `queries_night` and others.
+            The name of the result includes it, unless it is `queries`.
         ignore_zones: whether to compare coordinates of all zones as if in one plane, as the public
-            tools do. The name of a benchmark with several zones then says so.
+            tools do. The name of the result then says so.
 
     Raises:
         InputError: no such split or folder, a folder without images, a name without coordinates, a

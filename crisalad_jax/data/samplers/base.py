@@ -34,15 +34,15 @@ class Draw(NamedTuple):
     generator: np.random.Generator
     """Random generator, the same for the same seed and epoch."""
     described: Int[np.ndarray, " n"]
-    """Images of `Sampler.images_to_describe`; none if `Sampler.describes` is False."""
+    """Indices of the images of `Sampler.images_to_describe`; none if `describes` is False."""
     descriptors: Float[np.ndarray, "n descriptor"]
-    """Their descriptors by the current model; NaN for images that cannot be read."""
+    """Descriptors of these images by the current model; NaN for images that cannot be read."""
 
 
 class Sampler(Part, abc.ABC):
     """A way to draw batches from places: a frozen dataclass with its settings as fields.
 
-    A plain function of (places, draw) is a sampler without settings.
+    A plain function of (places, draw) can be registered as a sampler without settings.
 
     Example:
         >>> import numpy as np
@@ -56,18 +56,18 @@ class Sampler(Part, abc.ABC):
     """
 
     describes: ClassVar[bool] = False
-    """Whether it uses descriptors, which the current model computes when an epoch begins."""
+    """Whether the sampler uses descriptors, which the model computes when an epoch begins."""
     regroups: ClassVar[bool] = False
-    """Whether it regroups images: a group serves as a place, and may mix images of several of the
-    set's places, also of those with few images."""
+    """Whether the sampler makes groups of images that serve as places: a group may mix images of
+    several of the set's places, also of places with few images."""
 
     def check(self, places: Places) -> None:
-        """Raise InputError if it cannot draw from these places; by default never."""
+        """Raise InputError if the sampler cannot draw from these places; by default never."""
 
     def images_to_describe(
         self, places: Places, generator: np.random.Generator
     ) -> Int[np.ndarray, " n"]:
-        """Return the images of `Draw.descriptors`; by default a random one of each place."""
+        """Return the indices of the images to describe; by default a random one of each place."""
         return generator.integers(places.place_start[:-1], places.place_start[1:])
 
     @abc.abstractmethod
@@ -81,9 +81,9 @@ class Sampler(Part, abc.ABC):
             draw: the size of a batch, and random numbers.
 
         Returns:
-            Places in an order, in which consecutive ones make a batch, or the images of every
-            batch. An order may omit a place, or repeat it with other images. A place that is
-            `Places.near` another of its batch moves to a later batch.
+            Indices of places in an order in which consecutive places make a batch; or indices of
+            images, by batch and place. An order may omit a place, or repeat it with other images. A
+            place that is `Places.near` another of its batch moves to a later batch.
         """
 
 
@@ -116,15 +116,15 @@ def epoch_batches(
         seed: seed of the draws, together with the epoch.
         epoch: index of the epoch, from 0.
         steps: number of batches; None takes what the sampler draws in one call.
-        describe: describes images; for samplers with `Sampler.describes`.
+        describe: function from image files to descriptors, for samplers with `describes`.
 
     Returns:
         Indices of images.
 
     Raises:
-        InputError: a place has too few images, the sampler finds no batch, or returns anything but
-            what `Sampler.apply` specifies; no such sampler, a negative seed or epoch, less than one
-            step, or a missing `describe`.
+        InputError: a place has too few images; the sampler finds no batch, or returns anything but
+            what `Sampler.apply` specifies; there is no such sampler; the seed or epoch is negative;
+            `steps` is below 1; or `describe` is missing.
     """
     drawn_by = SAMPLERS.resolve(sampler, "sampler")
     least = 1 if steps is None else steps
@@ -177,7 +177,7 @@ def epoch_batches(
 def labels_of(
     places: Places, sampler: Sampler, chosen: Int[np.ndarray, "steps places images"]
 ) -> Int[np.ndarray, "steps places images"]:
-    """Return the images' places; group numbers in the batch if the sampler makes its own places."""
+    """Return each image's place, or its group's number in the batch if the sampler regroups."""
     if sampler.regroups:
         return np.broadcast_to(np.arange(chosen.shape[1], dtype=np.int32)[:, None], chosen.shape)
     return places.image_place[chosen]

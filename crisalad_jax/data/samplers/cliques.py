@@ -1,4 +1,4 @@
-"""CliqueMining, and SAGE's version: places made of images close together, in similar streets.
+"""CliqueMining, and SAGE's version: groups of images close together, from similar places.
 
 Written from the paper (Izquierdo and Civera, "Close, But Not There: Boosting Geographic Distance
 Sensitivity in Visual Place Recognition", ECCV 2024). There an earlier model describes the clusters
@@ -19,30 +19,30 @@ from crisalad_jax.utils.shapes import Float, Int
 
 @SAMPLERS.register("cliques")
 class Cliques(Sampler):
-    """Groups of images within `radius` of each other, but not of an image of another group.
+    """CliqueMining: groups of images within `radius` of each other and of no other group's images.
 
-    A batch begins with a random place of the set, and others of its city, which are more likely to
-    be drawn the more they look like it. Their images are divided into groups; if these do not fill
-    the batch, it continues with another city.
+    A batch begins with a random place of the set and others of its city; the more similar a place
+    looks, the more likely it is drawn. The images of these places are divided into groups. If the
+    groups do not fill the batch, it continues with another city.
     """
 
     describes: ClassVar[bool] = True
     regroups: ClassVar[bool] = True
     radius: PositiveFloat = 25.0
-    """Metres."""
+    """Distance in metres: images of one group are closer, images of different groups are not."""
     similar: NonNegativeInt = 15
-    """Number of places drawn by their similarity to a random one."""
+    """Number of places that are drawn by their similarity to a random place."""
 
     def check(self, places: Places) -> None:
         """Require positions of all cities.
 
         Raises:
-            InputError: the images have none.
+            InputError: some images have no position, or all images of a city have the same one.
         """
         known_views(places, f"sampler {self.part_name}", headings=False)
 
     def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, "steps places images"]:
-        """Return enough batches to use every place once; fewer if some cannot be filled."""
+        """Return as many batches as would use every place once; fewer if some cannot be filled."""
         views = views_of(places)
         steps = max(1, len(places.names) // draw.places_per_batch)
         batches = (self._batch(places, views, draw) for _ in range(steps))
@@ -114,8 +114,8 @@ class GeoVisual(Cliques):
     """
 
     anchors: PositiveInt = 16
-    """Number of random places; that of highest affinity begins. Affinity is the summed similarity
-    to the `similar` most similar places of its city."""
+    """Number of random candidates for the first place, which is that of the highest affinity: its
+    summed similarity to the `similar` most similar places of its city."""
 
     def _first(self, among: Int[np.ndarray, " place"], places: Places, draw: Draw) -> int:
         drawn = draw.generator.choice(among, min(self.anchors, len(among)), replace=False)

@@ -11,16 +11,16 @@ from crisalad_jax.utils.shapes import Int
 
 @SAMPLERS.register("hard-negatives")
 class HardNegatives(Sampler):
-    """A random place and those that look most like it to the model when an epoch begins.
+    """Batches of a random place and the places that look most like it to the model.
 
-    One image represents each place. GPM (Ali-bey et al., BMVC 2022) draws such batches by proxies
-    that are trained with the model.
+    The model describes one image of each place when an epoch begins. GPM (Ali-bey et al., BMVC
+    2022) draws such batches by proxies that are trained with the model.
     """
 
     describes: ClassVar[bool] = True
 
     def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, " order"]:
-        """Return every place once: each batch is a random one and those nearest to it."""
+        """Return every place once: each batch is a random place and those most similar to it."""
         left = draw.generator.permutation(len(places.names))
         order = []
         while len(left):

@@ -18,12 +18,12 @@ class Shuffled(Sampler):
 
 @SAMPLERS.register("within-city")
 class WithinCity(Sampler):
-    """City after city in random order, as in the public loaders.
+    """Places city after city, in random order, as in the public loaders.
 
     A batch is then nearly always of one city, whose places are hard to tell apart.
     """
 
     def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, " order"]:
-        """Return every place once, those of a city together."""
+        """Return every place once, with the places of a city together."""
         city_rank = draw.generator.permutation(len(places.cities))[places.place_city]
         return np.lexsort((draw.generator.random(len(places.names)), city_rank))

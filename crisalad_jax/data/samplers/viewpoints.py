@@ -19,7 +19,7 @@ _SIDES = ("lateral", "frontal")
 
 @SAMPLERS.register("viewpoints")
 class Viewpoints(Sampler):
-    """Images that look at one point, from different positions of a street.
+    """Places made of images that look at one point from different positions in a street.
 
     The places of a batch are classes of one of EigenPlaces' groups, none of which are neighbours.
     MegaLoc trains on both sides at once, each in its own sub-batch.
@@ -27,21 +27,21 @@ class Viewpoints(Sampler):
 
     regroups: ClassVar[bool] = True
     side: Literal["lateral", "frontal"] = "lateral"
-    """Whether the point is across the street or along it."""
+    """Where the point is: "lateral" is across the street, "frontal" along it."""
     cell: PositiveFloat = 15.0
     """Side of a cell in metres; its images make at most one class of each side."""
     spacing: PositiveInt = 3
-    """Distance in cells between classes of a batch."""
+    """Smallest distance in cells between the cells of two classes in a batch."""
     focal_distance: PositiveFloat = 10.0
     """Metres from the mean of a cell's positions to the point."""
     view_angle: PositiveFloat = 45.0
-    """Largest angle in degrees between an image's heading and the point."""
+    """Largest angle in degrees between an image's heading and the direction to the point."""
 
     def check(self, places: Places) -> None:
         """Require positions and headings of all images.
 
         Raises:
-            InputError: some have none.
+            InputError: some images have no position or no heading.
         """
         known_views(places, f"sampler {self.part_name}", headings=True)
 

@@ -25,7 +25,7 @@ class CheckedPart:
     """A part of a folder: a split, or a folder of queries."""
 
     name: str
-    """Its name according to `open_benchmark`; if it cannot be opened, its location."""
+    """Name of the part according to `open_benchmark`; if it cannot be opened, its location."""
     database: int | None = None
     """Number of database or training images."""
     queries: int | None = None
@@ -46,7 +46,7 @@ class CheckedFolder:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What is wrong with its parts."""
+        """Problems of the parts, each with the name of its part."""
         return tuple(f"{each.name}: {each.problem}" for each in self.parts if each.problem)
 
 
@@ -58,15 +58,15 @@ def check_set(
     read: bool = True,
     quiet: bool = False,
 ) -> CheckedFolder:
-    """Count a folder's images, identify its data set, and compare with the published counts.
+    """Count a folder's images, identify its data set, and compare with published counts.
 
-    Every split, every folder of queries and every file of lists in it is opened as `evaluate` does,
-    or GSV-Cities' layout as `train` does.
+    Every split, every folder of queries and every file of lists in the folder is opened as by
+    `evaluate`; the layout of GSV-Cities is opened as by `train`.
 
     Args:
         folder: the folder, or one file of lists in it.
-        expected: name of the set in `SETS` that it should be; None allows any, and a custom set
-            is then not compared.
+        expected: name in `SETS` of the set that the folder should hold; None allows any, and a
+            custom set is then not compared.
         read: whether to decode every image too.
         quiet: whether to hide the progress bar.
 
@@ -74,7 +74,7 @@ def check_set(
         The parts of the folder, with their problems.
 
     Raises:
-        InputError: there is no such set, or no data in a layout of docs/datasets.md.
+        InputError: there is no such set or folder, or no data in a layout of docs/datasets.md.
 
     Example:
         >>> import shutil

@@ -29,22 +29,22 @@ _LAYOUTS = ("images", "train_val")
 def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> pathlib.Path:
     """Download a public data set into a new folder.
 
-    Unfinished downloads are in a folder next to it, `to`.part, from which the next call resumes.
-    The folder `to` appears when everything is complete.
+    Unfinished downloads are in a folder `to`.part next to it, from which the next call resumes. The
+    folder `to` appears when everything is complete.
 
     Args:
         name: name of a set in `SETS`.
-        to: the folder, new or empty.
+        to: folder for the set, new or empty.
         quiet: whether to hide progress bars.
 
     Returns:
-        The folder.
+        The path of the folder.
 
     Raises:
         InputError: no such set, or one that has to be requested from a person; the network is
-            forbidden; the disk lacks space; what `download` and `unpack` raise; or the files are
-            not those of the set.
-        ModuleNotFoundError: the set is at a hub whose client, extra `data`, is not installed.
+            forbidden; the disk lacks space; a download fails or an archive is damaged; or the files
+            are not those of the set.
+        ModuleNotFoundError: the set is on Hugging Face or Kaggle, and the extra `data` is missing.
 
     Example:
         >>> fetch_set("msls", folder / "msls")

@@ -10,29 +10,29 @@ from typing import Any, Literal
 from crisalad_jax.utils.errors import InputError
 
 Host = Literal["http", "huggingface", "kaggle", "rsync", "google-drive", "form", "request"]
-"""Where a set is: an open address, a hub, or a person to ask."""
+"""Kind of place that a set comes from: an open address, a hub, or a person to ask."""
 FETCHED: tuple[Host, ...] = ("http", "huggingface", "kaggle", "rsync")
 """Hosts that a program may download from."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SetFile:
-    """A file of a set."""
+    """A file to download for a set."""
 
     address: str
     """Address, or OWNER/NAME at a hub."""
     file: str = ""
-    """Path at the hub; for an address, the file's name if the address lacks it."""
+    """Path at the hub; for an address, the name of the file if the address lacks it."""
     sha256: str | None = None
     """SHA-256 of the file; None if not published."""
     into: str = ""
-    """Where it is unpacked, or copied if not an archive."""
+    """Path below the set's files where it is unpacked or, if it is not an archive, copied."""
     inside: str = ""
-    """An archive in it that holds the images."""
+    """Name of an archive in the file that holds the images; "" if there is none."""
 
     @property
     def name(self) -> str:
-        """Its name on disk."""
+        """Name of the file on disk."""
         return (self.file or self.address).rpartition("/")[2]
 
 
@@ -42,15 +42,15 @@ class SetPart:
 
     name: str
     database: int | None = None
-    """Number of images; None if unknown."""
+    """Number of database images; None if unknown, as for `queries`."""
     queries: int | None = None
     printed: str = ""
-    """A regular expression for the beginning of the name that `open_benchmark` gives it, if other
-    sets have the same counts, or none are known."""
+    """Regular expression for the beginning of the name that `open_benchmark` gives the part; for
+    parts whose counts other sets have too, or are unknown."""
 
     @property
     def words(self) -> str:
-        """Its name and counts, for a message."""
+        """Name and counts of the part, for a message."""
         counts = (("database images", self.database), ("queries", self.queries))
         known = [f"{count:,} {what}" for what, count in counts if count is not None]
         return f"{self.name}: {' and '.join(known) or 'no count is published'}"
@@ -66,7 +66,7 @@ class PublishedSet:
     page: str
     """Address of the page that publishes it."""
     command: str
-    """Command that reads it, for a folder DIR."""
+    """Command that reads the set from a folder DIR."""
     sources: tuple[str, ...]
     """Sources of these facts."""
     files: tuple[SetFile, ...] = ()
@@ -75,28 +75,28 @@ class PublishedSet:
     licence: str | None = None
     """Licence or terms; None if unknown."""
     ask: str = "nobody"
-    """Whom a user has to ask."""
+    """Whom a user has to ask, or what to do first, such as filling in a form."""
     steps: tuple[str, ...] = ()
-    """Steps to do by hand."""
+    """Steps to do by hand, with DIR for the folder."""
     parts: tuple[SetPart, ...] = ()
     cities: tuple[str, ...] = ()
     """Cities of a set of training places."""
     renamed: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """New names of files that are renamed for `evaluate`, by old name."""
     pairs: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Folders of database and queries; images with the same number show the same place."""
+    """Folders of a database and queries in which images of the same number show the same place."""
     frames: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Folders of the database and the queries, the list of their frames, and the metres between
-    two."""
+    """Folders of the database and the queries, the file that lists their frames, and the metres
+    between two frames."""
     note: str = ""
 
     @property
     def is_fetched(self) -> bool:
-        """Whether a program may download it."""
+        """Whether `fetch_set` can download the set."""
         return self.host in FETCHED
 
     def by_hand(self, folder: str) -> list[str]:
-        """List the steps to do by hand, for a folder."""
+        """List steps to do by hand, then the commands that check and read the set in `folder`."""
         checked = f"crisalad data check DIR --set {self.name}"
         return [step.replace("DIR", folder) for step in (*self.steps, checked, self.command)]
 

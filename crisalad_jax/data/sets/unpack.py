@@ -37,8 +37,8 @@ def unpack(archive: pathlib.Path, folder: pathlib.Path, *, quiet: bool = False) 
         quiet: whether to hide the progress bar.
 
     Raises:
-        InputError: it is damaged, contains something that the filter refuses, or does not fit on
-            the disk; or the disk is full.
+        InputError: the archive is damaged, contains something that the filter refuses, or does not
+            fit on the disk.
     """
     with archive.open("rb") as file:
         if is_html(file.read(512)):

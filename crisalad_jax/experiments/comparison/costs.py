@@ -1,4 +1,4 @@
-"""Costs of models: their speed, timed in turns under the same load, and the paper's Table 3."""
+"""Costs of models: speed, timed in turns under the same load; and of adapters (paper, Table 3)."""
 
 import dataclasses
 import functools
@@ -27,7 +27,7 @@ _LONG = 3.0
 
 
 class Spread(NamedTuple):
-    """Median and range of repeated measurements."""
+    """Median, minimum and maximum of repeated measurements."""
 
     median: float
     least: float
@@ -35,7 +35,7 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Spread | None":
-        """Summarise values; None if there are none."""
+        """Return the spread of some values; None if there are none."""
         return cls(statistics.median(values), min(values), max(values)) if values else None
 
 
@@ -45,15 +45,15 @@ def race(
     *,
     quiet: bool = True,
 ) -> dict[str, list[float]]:
-    """Time calls in turns; each call finishes all of its work before it returns.
+    """Time functions in turns, so that all of them run under the same load.
 
-    The first call of each contender, which compiles, does not count, nor does the first of each
-    turn. A call of `_LONG` or longer is then made once, any other `_CALLS` times. A contender
-    builds its call for each turn, so that only one model is in memory at a time. A progress bar
-    counts the turns, unless `quiet`.
+    A contender makes the function to time, which must finish its work before it returns. It makes
+    one for each turn, so that only one model is in memory at a time. Its very first call, which
+    compiles, does not count, nor does the first call of a turn; if that took three seconds or more,
+    one more call is timed, otherwise three. A progress bar counts the turns, unless `quiet`.
 
     Returns:
-        Seconds per call by name, the median of each round.
+        Seconds per call, by name: for each of the `rounds`, the median of its calls.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     with progress_bar("speed", (1 + rounds) * len(contenders), "turns", quiet=quiet) as bar:
@@ -71,7 +71,7 @@ def race(
 
 
 def ratios(rounds: Mapping[str, Sequence[float]], name: str, than: str) -> list[float]:
-    """Compare the times of two calls: one ratio per round, both times under the same load."""
+    """Divide the times of `name` by those of `than` in each round, when the load was the same."""
     pairs = zip(rounds[name], rounds[than], strict=True)
     return [ours / theirs for ours, theirs in pairs]
 
@@ -83,7 +83,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def machine() -> str:
-    """Return a short name of the device that is measured on."""
+    """Return a short name of the device that JAX computes on, such as "2 CPU cores"."""
     device = jax.devices()[0]
     if device.platform == "cpu":
         return f"{usable_cores()} CPU cores"
@@ -91,22 +91,22 @@ def machine() -> str:
 
 
 class AdapterCost(NamedTuple):
-    """A row of Table 3."""
+    """A row of the paper's Table 3, the costs of one adapter in a block, with our own counts."""
 
     adapter: str
     paper_parameters: int | None
     """Number of parameters as the paper counts them (docs/comparison.md); None for adapters that
-    it lacks."""
+    the paper lacks. The same holds for `paper_macs`."""
     parameters: int
-    """Number of parameters of one adapter here, with batch norms' running statistics."""
+    """Number of parameters of the adapter here, with the running statistics of batch norms."""
     paper_macs: int | None
     macs: int
-    """Multiply-accumulates that an adapter really adds to a block, per image."""
+    """Multiply-accumulates that the adapter really adds to a block, per image."""
     time: Spread | None
-    """Time of a block in a training step, relative to one without adapter, over the rounds; None if
-    not measured."""
+    """Time of the gradient of a block, divided by that without adapter; None if not measured."""
     memory: float | None
-    """Memory of that block, relative to one without adapter, as the compiler counts it."""
+    """Memory for that gradient by the compiler's count, divided by that without adapter; None if
+    not measured."""
 
 
 _PAPER_PARAMETERS: Mapping[str, int] = {
@@ -118,7 +118,7 @@ _PAPER_PARAMETERS: Mapping[str, int] = {
 
 
 def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
-    """Make the contenders for `race` that train a block with each adapter on four images."""
+    """Make contenders for `race`, by adapter name: the gradient of a block on four images."""
 
     def ready(name: str) -> Callable[[], Any]:
         inputs = _stack_and_tokens(name)
@@ -128,7 +128,7 @@ def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
 
 
 def adapter_memory(names: Iterable[str]) -> dict[str, int]:
-    """Return the bytes that training a block on four images takes, with each of these adapters."""
+    """Return the bytes that the gradient of a block on four images takes, by adapter name."""
     analyses = {name: _block_program(name).memory_analysis() for name in names}
     return {name: each.temp_size_in_bytes for name, each in analyses.items() if each is not None}
 
@@ -136,7 +136,7 @@ def adapter_memory(names: Iterable[str]) -> dict[str, int]:
 def adapter_costs(
     seconds: Mapping[str, Sequence[float]], memory: Mapping[str, int]
 ) -> list[AdapterCost]:
-    """Compute Table 3, for one adapter at the paper's size, with rows for all other adapters.
+    """Compute the paper's Table 3: the costs of one adapter in ViT-B/14, for all adapters here.
 
     Args:
         seconds: what `race` returns for `adapter_calls`; empty if nothing was measured.

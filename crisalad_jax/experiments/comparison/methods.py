@@ -1,4 +1,4 @@
-"""What is compared: the methods of the paper's Table 1, the rows of its Table 2, custom rows."""
+"""What can be compared: methods of the paper's Table 1, rows of its Table 2, and custom rows."""
 
 import dataclasses
 import itertools
@@ -58,8 +58,8 @@ METHODS: Mapping[str, ComparedMethod] = {
     "crisalad": ComparedMethod("CriSALAD", "crisalad"),
     "boq": ComparedMethod("BoQ", "boq"),
 }
-"""Methods in the order of Table 1. crisalad+NAME is the head of a method on CriSALAD's backbone,
-with CriSALAD's training. Other names are recipes or parts, without a second stage."""
+"""Methods in the order of the paper's Table 1. crisalad+NAME has the head of method NAME, with the
+backbone and training of CriSALAD; other names are recipes."""
 
 
 def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod:
@@ -68,14 +68,14 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
     Args:
         name: one of `METHODS`, or what `recipe` looks up: a recipe, or RECIPE+PART. A PART by
             itself means crisalad+PART.
-        preset: the size of the models.
-        what: what messages call the name.
+        preset: the size of the models, such as "b14".
+        what: the flag that gave the name, for messages.
 
     Returns:
-        The method; for a recipe, the title is its name.
+        The method; for a recipe that is not in `METHODS`, its title is the name of the recipe.
 
     Raises:
-        InputError: there is no such method, recipe or part.
+        InputError: there is no such method, recipe or part; or the recipe trains on several sets.
 
     Example:
         >>> method_of("crisalad+gem", "b14").title, method_of("step:newton", "b14").title
@@ -101,9 +101,9 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
 
 
 def is_method(name: str) -> bool:
-    """Return whether a name is a method's or a recipe's, or has the form RECIPE+PART or KIND:NAME.
+    """Return whether a name is that of a method or recipe, or looks like RECIPE+PART or KIND:NAME.
 
-    A part's name by itself does not count: with weights it may name any model.
+    The name of a part alone does not count, since with weights it may be the name of any model.
 
     Example:
         >>> is_method("salad"), is_method("crisalad+gem"), is_method("megaloc")
@@ -116,7 +116,7 @@ def is_method(name: str) -> bool:
 
 
 def split_second_stage(name: str) -> tuple[str, str | None]:
-    """Split a name into model and second stage; after a recipe's name, + adds a part instead.
+    """Split MODEL+STAGE into model and second stage; after a recipe, + adds a part instead.
 
     Example:
         >>> split_second_stage("fol-large+fol"), split_second_stage("crisalad+transvpr")
@@ -131,14 +131,14 @@ def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfi
 
     Args:
         name: what `recipe` looks up.
-        preset: the size of the model.
+        preset: the size of the model, such as "b14".
         from_nothing: whether training starts from random weights; see `from_scratch`.
 
     Returns:
-        The configuration.
+        The training configuration, with its model.
 
     Raises:
-        InputError: what `recipe` raises.
+        InputError: no such preset, recipe or part, or one that does not fit the preset.
 
     Example:
         >>> method_training("crisalad+light", "b14", from_nothing=True).augmentation
@@ -155,7 +155,7 @@ def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfi
 
 
 class Ablation(NamedTuple):
-    """A row of Table 2: CriSALAD with these settings."""
+    """A row of the paper's Table 2: settings of CriSALAD (`encoder`: the cross-image encoder)."""
 
     adapter: str = "depthwise"
     encoder: bool = True
@@ -163,7 +163,7 @@ class Ablation(NamedTuple):
     schedule: Literal["linear", "step"] = "linear"
 
     def training(self, preset: str, *, from_nothing: bool) -> TrainConfig:
-        """Make the paper's recipe, or for random weights that of `scratch`, with these settings."""
+        """Return the paper's recipe, or `scratch` if `from_nothing`, with the row's settings."""
         config, rate = recipe(preset, f"crisalad+adapter:{self.adapter}"), self.learning_rate
         if not self.encoder:
             model = dataclasses.replace(config.model, cross_image="none")
@@ -177,7 +177,7 @@ class Ablation(NamedTuple):
         return dataclasses.replace(config, optimiser=optimiser)
 
     def words(self, training: TrainConfig) -> str:
-        """Describe what the row changes, or CriSALAD's own settings; `training` is its recipe."""
+        """Describe what a row changes or, for CriSALAD, all settings; `training` is its recipe."""
         words = (
             f"adapter {self.adapter}",
             f"cross-image encoder {'yes' if self.encoder else 'no'}",
@@ -198,8 +198,8 @@ ABLATIONS: Mapping[str, Ablation] = {
     "no-encoder": Ablation(encoder=False),
     "no-encoder-step": Ablation(encoder=False, schedule="step"),
 }
-"""The paper's rows, and one without any adapter, which the paper lacks. The paper's last row, with
-the step schedule, is also here with the linear one, so that a single part changes."""
+"""Rows of the paper's Table 2, and two more: one without any adapter; and one without encoder that
+has the linear schedule, unlike the paper's, so that a single part changes."""
 
 
 _FLAG = re.compile(
@@ -215,7 +215,7 @@ trains on places, and does not validate."""
 
 
 class AblationRow(NamedTuple):
-    """A custom row: a recipe with settings changed by the flags of `train`."""
+    """A custom row: a recipe whose settings are changed by flags of `crisalad train`."""
 
     name: str
     recipe: str
@@ -229,11 +229,11 @@ class AblationRow(NamedTuple):
         return ", ".join(f"{flag}={value}" for flag, value in (*base, *self.flags))
 
     def sets(self, flag: str) -> bool:
-        """Return whether the row sets a flag, or one that starts with it."""
+        """Return whether the row sets a flag whose name starts with `flag`."""
         return any(own.startswith(flag) for own, _ in self.flags)
 
     def training(self, preset: str, *, from_nothing: bool) -> TrainConfig:
-        """Make the recipe with the changes.
+        """Return the training configuration: the recipe with the row's flags applied.
 
         Raises:
             InputError: no such recipe, flag or part, or a value that does not fit.
@@ -242,7 +242,7 @@ class AblationRow(NamedTuple):
         return self.changed(method_training(found, preset, from_nothing=from_nothing), preset)
 
     def changed(self, config: TrainConfig, preset: str) -> TrainConfig:
-        """Apply the row's changes to a configuration; raises what `training` raises."""
+        """Apply the row's flags to a configuration; the errors are those of `training`."""
         pairs = ((f"--{flag}", *shlex.split(value)) for flag, value in self.flags)
         arguments = [word for words in pairs for word in words]
         return parse_changes(config, arguments, preset, f"--row {self.name}")
@@ -256,10 +256,10 @@ def parse_row(text: str) -> AblationRow:
     "image-size=224 224", and quote a value with a comma or a space in it.
 
     Args:
-        text: the row.
+        text: the row's text.
 
     Returns:
-        The row; flags and values are checked when its configuration is made.
+        The row; its flags and values are checked later, by `AblationRow.training`.
 
     Raises:
         InputError: the text has another form, or a flag that is the same for all rows.

@@ -44,8 +44,8 @@ from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError, locate_errors
 
 EPOCHS = 6
-"""Number of epochs from random weights: all methods on two small sets, three seeds each, take less
-than an hour on two cores."""
+"""Default number of epochs from random weights. With it, all methods on two small sets, three seeds
+each, take less than an hour on two cores."""
 _VIEWS = 4
 """Largest number of images of a place in a batch, as in all recipes of the paper."""
 
@@ -62,40 +62,40 @@ class ComparisonConfig:
     """
 
     kind: Literal["compare", "ablate"]
+    """"compare" for methods, as in the paper's Table 1; "ablate" for rows, as in its Table 2."""
     names: tuple[str, ...]
-    """Names of `METHODS`, `ABLATIONS`, recipes and parts, and any others that `weights` defines."""
+    """What is compared: names of `METHODS`, `ABLATIONS`, recipes, parts and models in `weights`."""
     test: tuple[str, ...]
-    """Evaluation sets, in any layout that `open_benchmark` reads."""
+    """Paths of evaluation sets, in any layout that `open_benchmark` reads."""
     train: str | None = None
-    """Training set, in any layout that `read_places` reads."""
+    """Path of the training set, in any layout that `read_places` reads."""
     weights: tuple[str, ...] = ()
-    """Weights of methods that are not trained here, as NAME=FILE, or the NAME of a published model.
-    A name that is not a method's adds its own line, whatever model the file holds, and may end in +
-    and a second stage, as in fol-large+fol."""
+    """Weights of what is not trained here: NAME=FILE, or NAME of a published model. A NAME that is
+    not a method has its own row, whatever its model; + adds a second stage, as in fol-large+fol."""
     backbone: str | None = None
-    """Backbone that training starts from; None is random weights, as in the recipe `scratch`."""
+    """File of the backbone that training starts from; None is random weights, as in `scratch`."""
     preset: str = "b14"
     epochs: PositiveInt | None = None
     """Number of epochs; None is the recipe's, or `EPOCHS` from random weights."""
     image_size: tuple[int, int] | None = None
     resize: tuple[str, ...] = ()
-    """Changes to how images are resized, as `ModelConfig.resized` takes them."""
+    """Changes to how images are resized, as `ModelConfig.resized` takes them; none by default."""
     batch_size: PositiveInt = 16
     """Number of images described together."""
     on_bad_image: OnBadImage = "stop"
-    """What to do with unreadable images. "skip": training masks them out, and evaluation sets leave
-    them out; each call reads all images of these sets to find them."""
+    """"stop" at an unreadable image, or "skip" it: training masks it out, and evaluation sets leave
+    it out; each call then first reads all images of the evaluation sets."""
     grouping: str = "single"
     """Comma-separated groupings; methods without a cross-image encoder do not depend on them."""
     rerank: int = 20
     """Number of first retrievals that methods with a second stage re-rank."""
     seeds: PositiveInt = 3
-    """Number of runs of each method, with seeds from 0."""
+    """Number of runs of each method, with seeds 0, 1 and so on."""
     rows: tuple[str, ...] = ()
     """Custom rows of an ablation, as `parse_row` reads them."""
     reference: str | None = None
     """Name that differences, speeds and training times are relative to; None is crisalad, or the
-    first if that is not compared."""
+    first name if crisalad is not compared."""
 
     def __post_init__(self) -> None:
         """Check types and ranges, and that nothing is repeated; `prepare` looks names up."""
@@ -111,17 +111,17 @@ class ComparisonConfig:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Names of everything that is compared: `names`, then the custom rows."""
+        """Names of all that is compared: `names`, then those of the custom rows."""
         return (*self.names, *(parse_row(text).name for text in self.rows))
 
     @property
     def flag(self) -> str:
-        """Command-line flag that selects the lines."""
+        """Command-line flag that `names` come from."""
         return "--methods" if self.kind == "compare" else "--rows"
 
     @property
     def is_papers(self) -> bool:
-        """Whether the rows are those of the paper's Table 2; Table 3 is then measured too."""
+        """Whether only rows of the paper's Table 2 are compared; Table 3 is then measured too."""
         return self.kind == "ablate" and not self.rows
 
     @property
@@ -150,7 +150,7 @@ def file_name(name: str) -> str:
 
 
 def models_of(weights: Iterable[str]) -> tuple[str, ...]:
-    """Return the names in NAME=FILE, or in NAME only, that are not a method's.
+    """Return the names in texts NAME=FILE or NAME that are not the name of a method.
 
     Example:
         >>> models_of(["megaloc", "ours=run/best.safetensors", "salad=salad.safetensors"])
@@ -161,12 +161,12 @@ def models_of(weights: Iterable[str]) -> tuple[str, ...]:
 
 
 def names_to_compare(methods: Sequence[str] | None, weights: Sequence[str]) -> tuple[str, ...]:
-    """Return the lines of a comparison: the methods, and the models that weights add.
+    """Return the names to compare: methods, and models that weights add.
 
     Args:
-        methods: names of methods. None means those of `weights` if one of them is not a
-            method's, and otherwise all of `METHODS`.
-        weights: NAME=FILE, or the name of a published model.
+        methods: names of methods. None means the names in `weights` if one of them is not the name
+            of a method, and otherwise all of `METHODS`.
+        weights: texts NAME=FILE, or names of published models.
 
     Returns:
         The names, each once.
@@ -183,28 +183,28 @@ def names_to_compare(methods: Sequence[str] | None, weights: Sequence[str]) -> t
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One line of the table, with everything that its runs need."""
+    """One row of the table, with everything that its runs need."""
 
     name: str
     labels: tuple[str, ...]
-    """Cells of its row before the results."""
+    """Text cells of the row, before the results."""
     run: str
-    """Name of the run that makes its model, which other variants may share."""
+    """Name of the run that makes its model; other variants may share the run."""
     training: TrainConfig
-    """Configuration of its training with seed 0; for a model from a file only the model counts."""
+    """Configuration of its training with seed 0; for a model from a file, only `model` is used."""
     rerank: str | None = None
     """Second stage, as `--rerank` of `evaluate` reads it."""
     row: AblationRow | None = None
-    """What it changes, if it is a custom row."""
+    """The custom row that it stands for, if any."""
     weights: pathlib.Path | None = None
     """File of the model, if it comes from one."""
     places: Places | None = None
-    """Training set, if it is trained here or has a vocabulary; it includes small places if its loss
-    regroups the images."""
+    """Training set, if the model is trained here or has a vocabulary; it includes places with few
+    images if the loss regroups the images."""
     steps_per_epoch: int = 0
     """Training steps per epoch; 0 for a model from a file."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Everything that decides its model, as JSON values, with digests for files and sets."""
+    """Everything that decides its model, as JSON values, with checksums of files and sets."""
 
     @property
     def model(self) -> ModelConfig:
@@ -213,35 +213,35 @@ class Variant:
 
     @property
     def trains(self) -> bool:
-        """Whether the variant is trained here: not loaded from a file, nor only a vocabulary."""
+        """Whether its model is trained here: not read from a file, and more than a vocabulary."""
         return self.weights is None and self.model.aggregator.trainable
 
 
 @brief
 class Prepared(NamedTuple):
-    """A comparison whose parts fit together."""
+    """A comparison whose sets are read and whose configurations are checked."""
 
     config: ComparisonConfig
     variants: list[Variant]
     benchmarks: list[Benchmark]
     left_out: list[str]
-    """A line for each set that lost unreadable images."""
+    """A line of text for each evaluation set that unreadable images were left out of."""
 
 
 def prepare(config: ComparisonConfig, *, quiet: bool = True) -> Prepared:
-    """Read the sets and make and check all configurations, weights from files included.
+    """Read the sets of a comparison, and make and check all configurations and weight files.
 
     Args:
         config: the comparison's configuration.
         quiet: whether to hide the progress bar.
 
     Returns:
-        The comparison.
+        The comparison, ready to run.
 
     Raises:
-        InputError: a file cannot be read or holds another method's weights; something has to be
-            trained or clustered without a training set; a method does not fit the images, or its
-            parts do not fit together; more images would be re-ranked than a set has.
+        InputError: a file cannot be read, or has the weights of another method; a model has to be
+            trained, or its vocabulary built, without a training set; a method does not fit the
+            images, or its parts do not fit together; or `rerank` is more than a database holds.
     """
     files = _weights(config)
     benchmarks, left_out = _open_sets(config, quiet=quiet)
@@ -437,7 +437,7 @@ def _settings(
 
 
 def short_names(benchmarks: list[Benchmark]) -> list[str]:
-    """Make a unique short name for each set."""
+    """Make a unique short name for each benchmark, from its own name."""
     short = [benchmark.name.partition(" (")[0].partition("/")[0] for benchmark in benchmarks]
     return [
         name if short.count(name) == 1 else f"{name} {number}"

@@ -35,10 +35,10 @@ KS = (1, 5, 10)
 
 
 def read_result(path: pathlib.Path) -> dict[str, Any]:
-    """Read a file of results.
+    """Read a file of results of a comparison.
 
     Raises:
-        InputError: it cannot be read, or was changed.
+        InputError: the file cannot be read, or was changed after it was written.
     """
     try:
         return read_json(path, "a result of a comparison")
@@ -48,31 +48,31 @@ def read_result(path: pathlib.Path) -> dict[str, Any]:
 
 @dataclasses.dataclass
 class RunResult:
-    """The results of a run so far: `result.json` in its folder."""
+    """The results of a run so far, as in the file `result.json` of its folder."""
 
     settings: Mapping[str, Any]
-    """What decided its model; see `Variant.settings`."""
+    """What decided the model of the run; see `Variant.settings`."""
     training: dict[str, Any] | None = None
-    """Steps and times of its training, once that is finished."""
+    """Steps and times of its training; None until it is finished."""
     ranks: dict[str, dict[str, list[int]]] = dataclasses.field(default_factory=dict)
-    """Rank (from 1; 0: none) of each query's first correct answer, by evaluation and grouping."""
+    """Rank (1 is best, 0 none) of each query's first correct answer, by evaluation and grouping."""
 
     def write(self, folder: pathlib.Path) -> None:
-        """Write it into the run's folder atomically."""
+        """Write the results atomically to `result.json` in the run's folder."""
         write_json(folder / "result.json", dataclasses.asdict(self))
 
 
 class Evaluation(NamedTuple):
-    """One of the evaluations of a run."""
+    """An evaluation of a run: for one of its variants, on one benchmark."""
 
     key: str
-    """Everything that its result depends on, except the model."""
+    """Text with all that its result depends on, except the model: second stage, set, grouping."""
     variant: Variant
     benchmark: Benchmark
 
 
 class Run(NamedTuple):
-    """A model that is made once, by one process at a time, and evaluated for its variants."""
+    """A model, trained or loaded once with one seed, and its evaluations for several variants."""
 
     seed: int
     folder: pathlib.Path
@@ -80,14 +80,14 @@ class Run(NamedTuple):
 
     @property
     def variant(self) -> Variant:
-        """The first of the variants that share its model."""
+        """The first of the variants that share the run's model."""
         return self.evaluations[0].variant
 
     def read(self) -> RunResult:
-        """Read its result, or start a new one.
+        """Read the results in the run's folder; return empty ones if there are none.
 
         Raises:
-            InputError: the file was damaged, or the run was made with other settings.
+            InputError: the file is damaged, or the run was made with other settings.
         """
         path, settings = self.folder / "result.json", self.variant.settings
         if not path.exists():
@@ -103,14 +103,14 @@ class Run(NamedTuple):
 
     @property
     def is_done(self) -> bool:
-        """Whether nothing is left to train or to evaluate."""
+        """Whether the run has nothing left to train or evaluate; raises like `read`."""
         result = self.read()
         trained = result.training is not None or not self.variant.trains
         return trained and all(each.key in result.ranks for each in self.evaluations)
 
 
 def runs_of(prepared: Prepared, out: pathlib.Path) -> list[Run]:
-    """List the runs of a comparison: one per seed, but only one for a model from a file."""
+    """List a comparison's runs in `out`: each model with all seeds, or one if from a file."""
     config = prepared.config
     how = f"{config.grouping}, batches of {config.batch_size}"
     evaluations: dict[str, list[Evaluation]] = {}
@@ -143,45 +143,45 @@ class Recall(NamedTuple):
     mean: float
     """Mean over the seeds."""
     spread: float | None
-    """Sample standard deviation over the seeds; None with a single one."""
+    """Sample standard deviation over the seeds; None with a single seed."""
     interval: Interval
     """95 % interval of the mean over the queries: see `metrics.bootstrap_interval`."""
     by_seed: tuple[float, ...]
     difference: Difference | None = None
-    """Difference to the reference; None for the reference itself."""
+    """Difference from the reference method; None for the reference itself."""
 
 
 @brief
 class Row(NamedTuple):
-    """A line of the table: a method under one grouping."""
+    """A row of the table: a method under one grouping."""
 
     name: str
     labels: tuple[str, ...]
     grouping: str
     dimension: int
     recalls: Mapping[str, Mapping[int, Recall]]
-    """Recalls by set, then by K."""
+    """Recalls by evaluation set, then by K."""
     speed: float
-    """Number of images described in the time that the reference takes for one."""
+    """Number of images described in the time that the reference method takes for one image."""
     images_per_second: float | None
     """Speed in images per second; None on a CPU, where other load changes it."""
     parameters: int
     trained: int | None
     """Number of parameters that were trained; None for a model from a file."""
     training: Spread | None
-    """Training time relative to the reference's, for each pair of their runs; None if either has
-    fewer than two runs that had their device to themselves."""
+    """Training time divided by the reference's, for each pair of runs with a device to themselves;
+    None if either has fewer than two such runs."""
     training_seconds: Spread | None
-    """Steps times a step's median seconds, for those runs; None for fewer than two."""
+    """Steps times the median seconds of a step, for such runs; None for fewer than two of them."""
 
 
 @brief
 class Summary(NamedTuple):
-    """Contents of the tables and the page."""
+    """Contents of the tables and the page of a comparison."""
 
     kind: str
     headers: tuple[str, ...]
-    """Headers above the rows' labels."""
+    """Headers of the columns with the labels of the rows."""
     reference: str
     """Label of the row that differences, speeds and training times are relative to."""
     sets: Mapping[str, Benchmark]
@@ -196,9 +196,9 @@ def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any])
 
     Args:
         prepared: the comparison.
-        runs: its runs, which are done.
-        speed: the times of all models: "rounds", "batch_size", "device", whether seconds are
-            "absolute", and the times of "adapters" and "adapter_memory".
+        runs: its runs, all of them done.
+        speed: contents of speed.json: times of the models ("rounds") and "adapters", "device",
+            "batch_size", "adapter_memory", and whether the times are "absolute".
 
     Returns:
         The summary.
@@ -290,7 +290,7 @@ def _ranks(
 def recall_of(ranks: np.ndarray, k: int, reference: np.ndarray | None = None) -> Recall:
     """Compute Recall@K from (seed, query) ranks of the first correct retrieval, from 1; 0 is none.
 
-    Everything trained here has the same seeds; a model from a file has a single one.
+    Seeds are paired with those of the reference if both have as many: all trainings share them.
     """
     hits = (ranks > 0) & (ranks <= k)
     by_seed = tuple(hits.mean(axis=1).tolist())

@@ -1,9 +1,9 @@
 """The work of a comparison: runs, evaluations and timing, each done once, and then its tables.
 
-OUT/config.json                       what the last command here compared
-OUT/NAME/seed-S/result.json           a run's settings, the time of its training, its evaluations
+OUT/config.json                       configuration of the last comparison in the folder OUT
+OUT/NAME/seed-S/result.json           settings of a run, time of its training, its evaluations
 OUT/NAME/seed-S/run/                  its training, which can be resumed, or its vocabulary
-OUT/speed.json                        the timing of all models, and of adapters
+OUT/speed.json                        times of all models, and of adapters
 """
 
 import contextlib
@@ -71,29 +71,29 @@ def compare(
 ) -> Summary:
     """Train or load the methods of a comparison, evaluate them the same way, and write the tables.
 
-    As much as possible is checked before any work. The same call resumes after a kill. It also
-    continues in a folder that holds a part of the comparison, or more: methods, rows, seeds and
-    sets may be added.
+    As much as possible is checked before any work. The same call resumes after a kill. Methods,
+    rows, seeds and sets may be added or left out between calls: runs that `out` already holds are
+    not repeated.
 
     Args:
         config: the comparison's configuration.
-        out: the folder. In addition to the runs it holds table.md, table.csv, results.json and the
-            page index.html.
-        jobs: number of runs at once, as Ray tasks, each with its share of the devices. By
-            default 1; on a cluster one per GPU, or one per node if there are no GPUs.
-        cluster: Ray cluster: "local", "auto" or an address, as `cluster.connected` takes it. All
-            its nodes read the files of `config`, and write into `out`. None is this machine.
-        say: called with a line at the start and before each run.
+        out: folder for the runs, table.md, table.csv, results.json and the page index.html.
+        jobs: number of runs at a time; several are Ray tasks, each with its share of the devices.
+            None is 1 or, on a cluster, one per GPU, or one per node if there are no GPUs.
+        cluster: Ray cluster, "local", "auto", ray://HOST[:PORT] or HOST:PORT (docs/how-to/ray.md).
+            All its nodes must be able to read the files of `config`, and to write into `out`. None
+            is this machine.
+        say: called with a line of progress at the start and before each run.
         quiet: whether to hide progress bars.
 
     Returns:
         The results, as the tables show them.
 
     Raises:
-        InputError: what `prepare`, `fit`, `evaluate` and `summarise` raise; the folder holds
-            other files, or a run of the same name with other settings; another process is writing
-            to it; or there is no such cluster, or a node that cannot take part.
-        Interrupted: a signal asked it to stop; the same call resumes.
+        InputError: a file cannot be read, or something does not fit (`prepare`, `fit`, `evaluate`);
+            the folder holds other files, or a run of the same name with other settings; another
+            process is writing to it; or there is no such cluster, or a node cannot take part.
+        Interrupted: a signal stopped the comparison; the same call resumes it.
     """
     out = pathlib.Path(out)
     if jobs is not None:

@@ -27,7 +27,7 @@ _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"
 
 
 def write_tables(summary: Summary, out: pathlib.Path) -> None:
-    """Write table.md, table.csv, results.json, and index.html with its charts, recall_N."""
+    """Write table.md, table.csv, results.json, index.html, and a chart recall_N for each set."""
     write_text(out / "table.md", markdown(summary))
     write_csv(out / "table.csv", list(csv_rows(summary)))
     write_json(out / "results.json", as_json(summary))
@@ -42,13 +42,13 @@ def write_tables(summary: Summary, out: pathlib.Path) -> None:
 
 
 def markdown(summary: Summary) -> str:
-    """Write all tables and notes as Markdown."""
+    """Return all tables and notes as Markdown."""
     tables = [table.markdown() for table in tables_of(summary).values()]
     return "\n".join([*tables, *(f"{note}\n" for note in summary.notes)])
 
 
 def tables_of(summary: Summary) -> dict[str, Table]:
-    """Make the tables of a comparison by name; those without a row are left out."""
+    """Make the tables of a comparison, by name; tables without rows are left out."""
     first = summary.headers[0]
     recalls, differences, costs = [], [], {}
     for row in summary.rows:
@@ -135,7 +135,7 @@ def _ratios(times: Sequence[float]) -> str:
 
 
 def adapter_cells(cost: AdapterCost) -> dict[str, str]:
-    """Format the cost of an adapter by header."""
+    """Format the costs of an adapter as cells, by header; "-" is what the paper or run lacks."""
     paper = parameters = flops = NOTHING
     if cost.paper_macs is not None:
         paper, flops = (f"{count * cost.paper_macs / 1e6:.3f}" for count in (1, 2))
@@ -155,7 +155,7 @@ def adapter_cells(cost: AdapterCost) -> dict[str, str]:
 
 
 def as_json(summary: Summary) -> dict[str, Any]:
-    """Convert everything to JSON values; recalls are fractions."""
+    """Convert a summary to JSON values; recalls are fractions, and sets are names."""
     names = {name: each.name for name, each in summary.sets.items()}
     return _plain(summary) | {"sets": names}
 
@@ -180,7 +180,7 @@ _COLUMNS = (
 
 
 def csv_rows(summary: Summary) -> Iterator[dict[str, Any]]:
-    """Yield a line of table.csv for each row, set and K: recalls as fractions."""
+    """Yield a line of table.csv for each row, set and K, by column; recalls are fractions."""
     columns, nothing = [*summary.headers, *_COLUMNS], (None,) * 3
     for row in summary.rows:
         costs = (row.dimension, row.speed, row.images_per_second, row.parameters, row.trained)

@@ -37,22 +37,22 @@ class Share(NamedTuple):
     device: str
     """What a task reserves: "GPU", or "CPU" for cores."""
     size: float
-    """How many of these; a fraction where tasks share one."""
+    """Number of GPUs or cores per task; a fraction if tasks share a GPU or core."""
     at_once: int
-    """Number of tasks at once."""
+    """Number of tasks that run at a time."""
     beside: bool
-    """Whether tasks share a device; without GPUs, whether a node may have two of them."""
+    """Whether tasks share a GPU; without GPUs, whether two tasks may run on one node."""
 
 
 def share_of(nodes: Sequence[Mapping[str, float]], jobs: int | None) -> Share:
-    """Share the devices of a cluster between tasks.
+    """Divide the devices of a cluster among tasks.
 
     Each task gets one or more GPUs; if there are too few, tasks share them, and their memory.
     Without GPUs a task reserves cores, but JAX computes on all cores of its node.
 
     Args:
-        nodes: the resources of each node, by Ray's names.
-        jobs: number of tasks at once. None is one per GPU, or one per node if there are no GPUs.
+        nodes: the resources of each node, by Ray's names for them, "CPU" and "GPU".
+        jobs: tasks at a time. None is one per GPU, or one per node if there are no GPUs.
 
     Returns:
         The share of each task.
@@ -89,13 +89,13 @@ def joined(
     """Join a cluster while the block runs, and yield the share of each task there.
 
     Args:
-        address: as `cluster.connected` takes it.
-        jobs: as `share_of` takes it.
+        address: "local", "auto", ray://HOST[:PORT] or HOST:PORT, as `cluster.connected` takes it.
+        jobs: number of tasks at a time; None is the default of `share_of`.
         read: files and folders; every node must be able to read those that exist here.
         write: a folder that every node must be able to write into.
 
     Raises:
-        InputError: what `connected` and `check_nodes` raise.
+        InputError: no such cluster; a node cannot take part; or no share becomes free in time.
     """
     names = filter(None, (*read, *loaded_plugins()))
     paths = [os.path.abspath(name) for name in names if os.path.exists(name)]
@@ -114,7 +114,7 @@ def joined(
 def in_turn(
     work: Callable[..., Any], shared: tuple[Any, ...], each: Iterable[tuple[Any, ...]] = ((),)
 ) -> list[Any]:
-    """Call a function with each set of arguments, after those that all calls share."""
+    """Return `work(*shared, *arguments)` for each tuple of arguments, one call after the other."""
     return [work(*shared, *given) for given in each]
 
 
@@ -124,15 +124,15 @@ def in_tasks(
     shared: tuple[Any, ...],
     each: Iterable[tuple[Any, ...]] = ((),),
 ) -> list[Any]:
-    """Do the work of `in_turn` in tasks of the cluster; return the results as they finish.
+    """Do the work of `in_turn` in Ray tasks; return the results in the order in which they finish.
 
     Arguments are taken from `each` as tasks start. A task whose worker is lost is started again. On
-    a signal, the tasks get Ctrl-C and time to save their work; a second signal does not wait for
-    it. An error in one task ends the others in the same way.
+    a signal, the tasks get Ctrl-C and up to five minutes to save their work; a second signal ends
+    the wait. An error in one task ends the others in the same way.
 
     Raises:
-        InputError: what a call raises; or a task has lost too many workers.
-        Interrupted: a signal asked it to stop.
+        InputError: a call raised it, or a task lost its worker ten times.
+        Interrupted: a signal stopped the work.
     """
     import ray
     from ray.exceptions import RayError, RayTaskError, UnserializableException

@@ -1,4 +1,4 @@
-"""Reports of a run: tables, curves, galleries of predictions, and a page of an evaluation."""
+"""Reports of a run: tables, curves, galleries of retrievals, and a web page of an evaluation."""
 
 from crisalad_jax.experiments.report.charts import recall_curves as recall_curves
 from crisalad_jax.experiments.report.charts import training_curves as training_curves

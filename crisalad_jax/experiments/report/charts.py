@@ -30,8 +30,8 @@ from crisalad_jax.experiments.report.style import (
 from crisalad_jax.retrieval.neighbours import Neighbours
 
 OUTCOMES = ("wrong", "no positive", "right")
-"""Possible outcomes of a query: its first retrieval is wrong although another image is correct, no
-database image is correct, or the first retrieval is correct."""
+"""Possible outcomes of a query: "wrong" if its first retrieval is not correct but another database
+image is, "no positive" if none is, and "right" if the first retrieval is correct."""
 _DASHES = ("-", "--", ":")
 # Key, title of the panel, and whether to smooth it because batches make it noisy.
 _LOSSES = (
@@ -55,7 +55,7 @@ def recall_curves(
     Args:
         curves: fractions of the queries, 0 to 1, by name and K.
         title: title above the picture.
-        wide: whether the figure is stand-alone, not part of a page that is also read on phones.
+        wide: whether the figure stands alone, rather than in a page that is also read on phones.
 
     Returns:
         The figure.
@@ -84,14 +84,14 @@ def precision_curves(curves: Mapping[str, PrecisionRecall]) -> Picture:
 
 
 def training_curves(records: Sequence[Mapping[str, int | float]]) -> Picture:
-    """Draw a run: its losses, learning rate and validation recalls against the step.
+    """Draw the loss, learning rate and validation recalls of a training run against its steps.
 
-    Each of these in the records gets a panel. Long noisy series are pale, under their running mean.
+    Each series has a panel; recalls share one. Long noisy series are pale, below a running mean.
 
     Args:
-        records: the lines of metrics.jsonl, each with "step" and any of "loss",
-            "easy_anchor_fraction", "accuracy", "learning_rate", and "R@K" as a fraction of the
-            queries, 0 to 1.
+        records: the lines of metrics.jsonl (`read_metrics`), each with "step" and any of "loss",
+            "easy_anchor_fraction", "accuracy", "learning_rate", and recalls such as "R@1" as
+            fractions of the queries, 0 to 1.
 
     Returns:
         The figure.
@@ -151,31 +151,31 @@ def _draw_series(axes: Axes, series: Mapping[int, float], noisy: bool) -> None:
 
 
 def outcomes_of(neighbours: Neighbours, positives: Sequence[Int[np.ndarray, " _"]]) -> np.ndarray:
-    """Return the outcome of each query, one of `OUTCOMES`, by its first retrieval."""
+    """Return the outcome of each query, one of `OUTCOMES`, as an array of texts."""
     right = right_retrievals(neighbours.indices[:, :1], positives)[:, 0]
     matched = [len(wanted) > 0 for wanted in positives]
     return np.where(right, "right", np.where(matched, "wrong", "no positive"))
 
 
 class Positions(NamedTuple):
-    """Where images were taken, and which of these positions are plausible."""
+    """Positions of images in metres, and which images are placed: at a plausible position."""
 
     database: Float[np.ndarray, "n axis"]
     queries: Float[np.ndarray, "q axis"]
     database_placed: Bool[np.ndarray, " n"]
     queries_placed: Bool[np.ndarray, " q"]
     limit: float
-    """Metres from the centre beyond which an image is out of place."""
+    """Metres from the median position beyond which an image is not placed."""
 
 
 def find_placed(
     database: Float[np.ndarray, "n axis"], queries: Float[np.ndarray, "q axis"]
 ) -> Positions:
-    """Separate images with a plausible position from those with a placeholder, such as (0, 0).
+    """Separate images with a plausible position in metres from those with a placeholder.
 
-    An image is out of place if it is over a kilometre from the median position, and over ten times
-    the distance within which nine tenths of the images lie. Images at (0, 0), or sharing a position
-    with many others, do not count in either. A second city with a tenth of the images is in place.
+    A position is implausible if it is over a kilometre from the median position, and over ten times
+    as far as the nearest nine tenths of the images. Neither limit counts images at (0, 0), or at a
+    position shared with many others. A second city with a tenth of the images is plausible.
     """
     points = np.concatenate([database, queries])
     _, which, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
@@ -193,16 +193,16 @@ def find_placed(
 def position_map(
     positions: Positions, first: Int[np.ndarray, " q"], outcomes: np.ndarray
 ) -> Picture:
-    """Draw a map of the images that are in place, in metres, with the same scale on both axes.
+    """Draw a map, in metres and to scale, of the images that have a plausible position.
 
     The database is grey. A query is a green dot if its first retrieval is correct, or a red cross,
     with a line to the retrieval, if it is wrong. It is a hollow triangle if no database image is
     correct.
 
     Args:
-        positions: positions of all images, in metres.
-        first: the first retrieval of each query, an index of the database.
-        outcomes: what `outcomes_of` returns.
+        positions: positions of all images, from `find_placed`.
+        first: index in the database of each query's first retrieval.
+        outcomes: outcome of each query, from `outcomes_of`.
     """
     points = flattened(np.concatenate([positions.database, positions.queries]))
     database, queries = np.split(points, [len(positions.database)])
@@ -254,7 +254,7 @@ def truth_cells(
     Args:
         positives: correct database indices of each query.
         database: number of images in the database.
-        shape: shape of the similarity map.
+        shape: shape of the map, (rows, columns), from `similarity_map`.
     """
     rows, columns = cells_of(len(positives), shape[0]), cells_of(database, shape[1])
     cells = np.zeros(shape, bool)
@@ -273,10 +273,10 @@ def similarity_matrix(
     """Draw a similarity map, with tinted ground truth and first retrievals as dots.
 
     Args:
-        similarities: the map that `similarity.similarity_map` returns.
+        similarities: the map, from `similarity.similarity_map`.
         positives: correct database indices of each of the q queries.
-        first: the first retrieval of each query; green if correct, red if not.
-        outcomes: what `outcomes_of` returns.
+        first: index in the database of each query's first retrieval; green if correct, else red.
+        outcomes: outcome of each query, from `outcomes_of`.
         database: number of images in the database.
     """
     queries = len(positives)

@@ -61,21 +61,21 @@ def show_retrievals(
 
     Args:
         found: answers of `query`, or one of the results of `evaluate`.
-        benchmark: the evaluated benchmark, for a result.
-        queries: indices of the queries to show, in this order. None takes evenly spaced ones, half
-            of them correct and half wrong if that is known.
+        benchmark: for a result, the evaluated benchmark without unreadable images; else None.
+        queries: indices of the queries to show, in this order. None takes evenly spaced ones; of a
+            result, half of them correct and half wrong.
         rows: maximum number of queries shown if `queries` is None.
-        columns: maximum number of retrievals shown for each.
-        root: folder of a map's images; None is the original one. A missing image is a grey box,
-            with a warning.
+        columns: maximum number of retrievals shown for each query.
+        root: for answers, folder of the map's images; None is the one that was indexed. A missing
+            image is a grey box, with a warning.
         title: title above the picture.
 
     Returns:
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: `found` is neither; a result without its benchmark, or answers with one; no
-            query, or an index out of range; or an image that cannot be read.
+        InputError: `found` of another class; a result without its benchmark, or answers with one;
+            no query, or an index out of range; or an image that cannot be read.
 
     Example:
         >>> import numpy as np, pathlib
@@ -111,13 +111,13 @@ def show_retrievals(
 def write_galleries(
     out: Path, benchmark: Benchmark, results: Sequence[GroupingResult], *, model_name: str
 ) -> None:
-    """Write a gallery of retrievals for each result of an evaluation, gallery_GROUPING.png.
+    """Write a gallery of queries and retrievals, gallery_GROUPING.png, for each result.
 
     Args:
         out: the folder, created if missing.
-        benchmark: the evaluated benchmark.
+        benchmark: the evaluated benchmark, without unreadable images.
         results: what `evaluate` returned.
-        model_name: name of the weights, for the titles.
+        model_name: name of the model, for the titles.
 
     Raises:
         InputError: an image cannot be read, or a picture cannot be written.
@@ -138,7 +138,7 @@ def first_right_ranks(
 
 
 def thumbnail(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Shrink a photograph to at most `side` pixels, so that a page of them fits in memory."""
+    """Shrink a photograph until its longer side has at most `side` pixels; never enlarge it."""
     factor = side / max(image.shape)
     if factor >= 1:
         return image
@@ -290,7 +290,7 @@ def _read(file: Path) -> _Shown:
 
 
 def shortened(text: str, most: int) -> str:
-    """Shorten a text to at most `most` characters, from its beginning and its end."""
+    """Shorten a text to at most `most` characters: an ellipsis replaces its middle."""
     if len(text) <= most:
         return text
     end = (most - 1) // 2

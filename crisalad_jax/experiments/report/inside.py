@@ -1,4 +1,4 @@
-"""Figures of the inside of a model: attention, gradients and a plane of descriptors."""
+"""Figures of what happens inside a model: attention, gradients, and descriptors in a plane."""
 
 import math
 import re
@@ -47,10 +47,10 @@ def show_attention(
     head: int | None = None,
     patch: tuple[int, int] | None = None,
 ) -> Picture:
-    """Draw what the class token, or a patch, attends to in a block of a vision transformer.
+    """Draw which patches the class token, or a patch, attends to in a block of a ViT.
 
     Each panel has its own colour scale, whose ends are in its title. Attention to the class token
-    and to registers is not drawn.
+    and to register tokens is not drawn.
 
     Args:
         image: an image file, or an array that `prepare_image` takes.
@@ -64,8 +64,8 @@ def show_attention(
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: no such head or patch; what `attention_maps` raises; or an image that cannot be
-            read or described.
+        InputError: no such block, head or patch; a backbone without attention maps; or an image
+            that cannot be read or described.
 
     Example:
         >>> import jax
@@ -125,21 +125,21 @@ def show_image_attention(
 ) -> Picture:
     """Draw which images attend to which in each layer of the cross-image encoder.
 
-    A row is an image that attends, a column one that it attends to. A cell is the attention weight,
-    averaged over tokens and heads, and written in percent for up to ten images. White is a uniform
-    share, one over the number of images.
+    Each row is an image that attends, each column one that it attends to. The colour of a cell is
+    the attention weight, averaged over tokens and heads; up to ten images also show it in percent.
+    White is uniform attention, a weight of one over the number of images.
 
     Args:
         images: image files or arrays, which are described together.
-        model: a model from `load`.
-        mask: see `describe`.
+        model: a model from `load`, with a cross-image encoder.
+        mask: whether image i may attend to image j, as in `describe`; None allows all pairs.
 
     Returns:
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: no images, or several sizes if the model does not resize; what
-            `cross_image_attention` raises; an image that cannot be read or described.
+        InputError: no images, or several sizes if the model does not resize; no cross-image encoder
+            with attention; a mask of another shape; or an image that cannot be read or described.
 
     Example:
         >>> import jax
@@ -200,12 +200,12 @@ def _draw_matrix(
 
 
 def show_gradient_norms(norms: Mapping[str, float]) -> Picture:
-    """Draw gradient norms by block, and those of the other parts.
+    """Draw the gradient norms of the backbone's blocks, and those of other parts of a model.
 
     The scale is logarithmic: a norm of 0, or one that is not finite, is not drawn.
 
     Args:
-        norms: what `gradient_norms` returns.
+        norms: gradient norms by name of the part, from `gradient_norms`.
 
     Returns:
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
@@ -264,7 +264,7 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: what `project_to_plane` raises, too many places, or not one for each descriptor.
+        InputError: descriptors on a line or not finite, or over 36 places, or not one for each.
 
     Example:
         >>> import numpy as np

@@ -1,4 +1,4 @@
-"""One HTML page of an evaluation, which embeds its pictures and loads nothing from the network."""
+"""The HTML page of an evaluation, which embeds its pictures and loads nothing from the network."""
 
 import json
 import math
@@ -55,17 +55,17 @@ def write_report(
 ) -> pathlib.Path:
     """Write index.html, its charts and results.csv into the folder `out`.
 
-    Retrievals, map and matrix are those of the first grouping; results.csv has a row for every
-    query under every grouping.
+    The retrievals, the map of positions and the matrix of similarities on the page are those of the
+    first grouping; results.csv has a row for every query under every grouping.
 
     Args:
         out: the folder, created if missing. Files of the same names are replaced.
-        benchmark: the evaluated benchmark.
-        groupings: the results, at least one.
-        model: the model, for the section on its transport, if it has one.
-        model_name: name of the weights.
-        settings: settings of an `evaluation_record`, shown collapsed.
-        similarities: what `similarity.similarity_map` returns for the first grouping.
+        benchmark: the evaluated benchmark, without unreadable images.
+        groupings: the results of `evaluate`, at least one.
+        model: the model; if it has an optimal transport, the page shows that of some images.
+        model_name: name of the model, for the page.
+        settings: settings from `evaluation_record`, which the page shows collapsed.
+        similarities: `similarity_map` of the first grouping; None leaves the matrix out.
 
     Returns:
         The path of the page.
@@ -122,7 +122,7 @@ def write_report(
 
 
 def render(template: str, context: Mapping[str, Any]) -> str:
-    """Render a template; in a page, everything in the context is escaped, file names too."""
+    """Render a Jinja template of this package; in an HTML page, all of the context is escaped."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -137,7 +137,7 @@ def render(template: str, context: Mapping[str, Any]) -> str:
 
 
 class Subject(NamedTuple):
-    """The evaluation that all sections show."""
+    """The evaluation that all sections of a page show."""
 
     benchmark: Benchmark
     neighbours: Neighbours
@@ -148,19 +148,19 @@ class Subject(NamedTuple):
 
     @classmethod
     def of(cls, benchmark: Benchmark, neighbours: Neighbours) -> "Subject":
-        """Judge an evaluation's retrievals and positions."""
+        """Make a subject from retrievals: judge their outcomes, and find plausible positions."""
         places, asked = benchmark.database_positions, benchmark.query_positions
         positions = None if places is None or asked is None else find_placed(places, asked)
         outcomes = outcomes_of(neighbours, benchmark.ground_truth())
         return cls(benchmark, neighbours, outcomes, positions)
 
     def name(self, path: pathlib.Path) -> str:
-        """Name a file of the benchmark by its path in the benchmark's folder."""
+        """Return a file's path relative to the benchmark's folder; outside it, only its name."""
         root = self.benchmark.root
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
     def metres(self, query: int, index: int) -> float | None:
-        """Measure the metres from a query to a database image; None without plausible positions."""
+        """Return the metres from a query to a database image; None without plausible positions."""
         places = self.positions
         if places is None:
             return None
@@ -169,10 +169,10 @@ class Subject(NamedTuple):
         return math.dist(places.queries[query], places.database[index])
 
     def choose(self, most: int = _SHOWN) -> dict[str, list[int]]:
-        """Choose at most `most` queries of each outcome, by similarity and then in file order.
+        """Choose at most `most` queries of each outcome; return their indices by outcome.
 
-        Of wrong queries and those without a positive, the most confident are taken, which would do
-        the most harm. Correct queries are spread evenly from the most to the least confident.
+        Of "wrong" and "no positive", the queries with the most similar first retrieval are chosen,
+        which would do the most harm; "right" ones are spread from the most to the least similar.
         """
         order = np.argsort(-self.neighbours.similarities[:, 0], kind="stable")
         wrong, unmatched, right = (order[self.outcomes[order] == each] for each in OUTCOMES)
@@ -199,7 +199,7 @@ def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[D
 def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[dict[str, Any]]:
     """Yield the result of each query under a grouping (first seed), as rows of results.csv.
 
-    Files are named by their path in the set's folder, with control characters escaped.
+    Files are named by their path in the benchmark's folder, with control characters escaped.
     """
     benchmark, neighbours = subject.benchmark, grouping.neighbours
     outcomes = outcomes_of(neighbours, benchmark.ground_truth()).tolist()
@@ -220,9 +220,9 @@ def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[dict[s
 
 
 def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
-    """Return the rows of the page's table, as short as JSON allows; see queries.js.
+    """Return the rows of the page's table of queries as short lists; queries.js reads them.
 
-    Names leave out the folder that all names of a column share.
+    Names of files leave out the folder that all names of their column share.
     """
     rows = list(query_results(subject, grouping))
     for name in ("query", "first_retrieval"):

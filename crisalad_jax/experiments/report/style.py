@@ -1,6 +1,6 @@
 """The common style of all figures, and how they are written and embedded in pages.
 
-They are drawn with matplotlib's object interface: no display, and no state outside the call.
+Figures use matplotlib's object interface, so they need no display and no state outside the call.
 """
 
 import base64
@@ -33,14 +33,14 @@ RIGHT = "#2a8f3c"
 WRONG = "#c62828"
 UNMATCHED = "#7b1fa2"
 PLAIN = "#c4c4c4"
-"""Colour of other images, such as the database on a map."""
+"""Colour of images without an outcome, such as the database on a map."""
 # Okabe and Ito's colours, which the colour-blind can tell apart; without yellow, too light for
 # lines.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 WIDE = {"width": 7.0, "dpi": 120}
-"""Size of a stand-alone figure."""
+"""Width in inches and dots per inch of a figure that is not part of a page."""
 FORMATS = (".png", ".svg", ".pdf")
-"""Formats in which a figure can be written: pixels for pages, and vectors for papers."""
+"""Suffixes of the files in which a figure is written: pixels for pages, vectors for papers."""
 _WEBP_QUALITY = 78
 _UNDATED = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
 # Names in an SVG are not random; a PDF has TrueType fonts, as publishers require.
@@ -63,7 +63,7 @@ class Picture(Figure):
 
 
 def new_figure(height: float, title: str = "", *, width: float = 4.0, dpi: int = 200) -> Picture:
-    """Make a figure of this size in inches.
+    """Make an empty figure of this size in inches, with a title that shrinks to fit.
 
     At the default size, 9-point text is readable in a page on a phone.
     """
@@ -83,7 +83,7 @@ def new_figure(height: float, title: str = "", *, width: float = 4.0, dpi: int =
 def label_axes(
     axes: Axes, x: str, y: str, *, grid: Literal["x", "y", "both"] = "y", title: str = ""
 ) -> None:
-    """Style axes: names, left and bottom spines, and pale grid lines."""
+    """Style axes: their names `x` and `y`, left and bottom spines, and pale lines along `grid`."""
     axes.set_xlabel(x, fontsize=10, color=INK)
     axes.set_ylabel(y, fontsize=10, color=INK)
     axes.set_title(title, fontsize=10, color=INK, loc="left")
@@ -106,7 +106,7 @@ def legend_below(figure: Figure) -> None:
 def scale_below(
     figure: Figure, plots: np.ndarray, scale: str, ends: tuple[float, float], label: str
 ) -> Any:
-    """Draw a colour bar below the plots, and return it."""
+    """Draw and return a colour bar below the plots, of colormap `scale` between the `ends`."""
     below: Any = {"location": "bottom", "shrink": 0.5, "aspect": 25, "pad": 0.02}
     colours = ScalarMappable(Normalize(*ends), scale)
     bar: Any = figure.colorbar(colours, ax=plots.ravel().tolist(), **below)
@@ -150,26 +150,26 @@ def save_chart(figure: Picture, path: pathlib.Path) -> None:
 
 
 class Drawing(NamedTuple):
-    """A picture in a page."""
+    """A picture in a page: its data URI, size in pixels, and alternative text."""
 
     uri: str
     width: int
     height: int
     alt: str
     kind: str = ""
-    """How the page frames it."""
+    """Style of its frame: query, right, wrong or expected; "" for none."""
     lines: tuple[str, ...] = ()
-    """Lines of text below it."""
+    """Lines of text below the picture."""
 
 
 def chart(figure: Picture, path: pathlib.Path, alt: str) -> Drawing:
-    """Write a figure with `save_chart`, and embed the PNG."""
+    """Write a figure with `save_chart`, and return its PNG for a page."""
     save_chart(figure, path)
     return _embed(figure, "png", path.read_bytes(), alt)
 
 
 def illustration(figure: Picture, alt: str) -> Drawing:
-    """Embed a figure with photographs in it, as a WebP."""
+    """Return a figure that shows photographs for a page, as a WebP."""
     data = _encode(figure, "webp", pil_kwargs={"quality": _WEBP_QUALITY})
     return _embed(figure, "webp", data, alt)
 
@@ -181,7 +181,7 @@ def _embed(figure: Figure, kind: str, data: bytes, alt: str) -> Drawing:
 def photograph(
     image: UInt8[np.ndarray, "h w 3"], alt: str, kind: str = "", lines: tuple[str, ...] = ()
 ) -> Drawing:
-    """Embed RGB pixels as a WebP of a few kilobytes."""
+    """Return RGB pixels for a page, as a WebP of a few kilobytes."""
     _, data = cv2.imencode(".webp", image[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])
     height, width = image.shape[:2]
     return Drawing(_uri("webp", data.tobytes()), width, height, alt, kind, lines)

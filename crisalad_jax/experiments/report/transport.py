@@ -31,11 +31,11 @@ Image = str | os.PathLike[str] | Pixels
 
 @takes(model=Model)
 def show_transport(image: Image, model: Model) -> Picture:
-    """Draw a picture, each patch's share in the dustbin, and the cluster that took most of it.
+    """Draw an image, the share of each patch in the dustbin, and the cluster that took most of it.
 
-    The seven strongest clusters have colours; patches that went to others stay grey. A colour's
-    strength is the mass that clusters took from the patch. A transport without a dustbin has no
-    middle panel.
+    The seven strongest clusters have colours; patches that went to others stay grey. A colour is
+    stronger the more mass all clusters took from the patch. A transport without a dustbin, which
+    takes patches that belong to no cluster, has no middle panel.
 
     Args:
         image: an image file, or an array that `prepare_image` takes.
@@ -45,8 +45,8 @@ def show_transport(image: Image, model: Model) -> Picture:
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: the model's aggregator has no transport, parameters of another configuration,
-            an image that cannot be read, or one that the model cannot describe.
+        InputError: the aggregator has no transport, the parameters do not fit the configuration,
+            or the image cannot be read or described.
 
     Example:
         >>> import jax
@@ -63,17 +63,17 @@ def show_transport(image: Image, model: Model) -> Picture:
 
 
 def read_rgb(image: Image, model: Model) -> Pixels:
-    """Read an image, if it is a file, and make it 8-bit RGB as the model's configuration says."""
+    """Read an image if it is a file; convert it to 8-bit RGB as the model's configuration says."""
     pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
     return as_rgb(pixels, model.config.preprocessing.bit_depth)
 
 
 class Transported(NamedTuple):
-    """A photograph and the transport plan of its patches."""
+    """An RGB photograph, the transport plan of its patches, and the number of clusters."""
 
     image: UInt8[np.ndarray, "h w 3"]
     masses: Float[np.ndarray, "row column destination"]
-    """Mass from each patch to each cluster; a dustbin comes last."""
+    """Mass from each patch to each cluster, and last to the dustbin, if there is one."""
     clusters: int
 
     @property
@@ -83,19 +83,19 @@ class Transported(NamedTuple):
 
     @property
     def dustbin(self) -> Float[np.ndarray, "row column"] | None:
-        """Share of each patch's mass in the dustbin; None without a dustbin."""
+        """Share of each patch's mass that went to the dustbin, 0 to 1; None without a dustbin."""
         if self.masses.shape[-1] == self.clusters:
             return None
         return self.masses[..., self.clusters] / self.masses.sum(axis=-1)
 
     @property
     def top(self) -> Int[np.ndarray, "row column"]:
-        """Cluster that took most of each patch."""
+        """Index of the cluster that took the most mass from each patch."""
         return self.taken.argmax(axis=-1)
 
 
 def transport_of(image: Pixels, model: Model) -> Transported:
-    """Compute the transport of a photograph, resized as the configuration says."""
+    """Compute the transport plan of an RGB image, resized as the configuration says."""
     params, config = model
     prepared = prepare_image(image, config)
     grid = config.backbone.grid((prepared.shape[0], prepared.shape[1]))
@@ -104,11 +104,11 @@ def transport_of(image: Pixels, model: Model) -> Transported:
 
 
 def strongest_clusters(pictures: Sequence[Transported]) -> dict[int, float]:
-    """Find the clusters that take the most mass from the patches that they win.
+    """Find up to seven clusters that take the most mass from the patches that they win.
 
-    A cluster wins a patch if it takes more of it than any other does. Each cluster comes with that
-    mass as a share of all mass that clusters took, largest first. (Over all patches of an image
-    every cluster takes the same mass, so that total would not rank them.)
+    A cluster wins a patch if it takes more mass from it than any other cluster. The result maps its
+    index to its mass from these patches as a share of the mass of all clusters, largest first.
+    (From all patches of an image every cluster takes the same mass, which would not rank them.)
     """
     mass = np.zeros(pictures[0].clusters)
     for picture in pictures:
@@ -125,7 +125,7 @@ def draw_transport(
 
     Args:
         pictures: the pictures to draw, by the name of their row.
-        among: the pictures that share one scale, and one choice of clusters.
+        among: the pictures from which the scale and the coloured clusters are chosen.
         photographs: whether each row begins with the photograph itself, in a larger figure.
     """
     clusters = strongest_clusters(among)
@@ -165,7 +165,7 @@ def draw_transport(
 
 
 def draw_panel(axes: Axes, image: Pixels, title: str, over: np.ndarray | None = None) -> None:
-    """Draw a photograph; with `over`, in grey under a value or colour for each patch."""
+    """Draw a photograph; with `over`, in grey below a value or an RGBA colour of each patch."""
     axes.set(xticks=[], yticks=[], anchor="N")
     axes.spines[:].set_visible(False)
     axes.set_title(title, loc="left", fontsize=9, color=INK)

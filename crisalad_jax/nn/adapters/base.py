@@ -17,7 +17,7 @@ AnyTokens = Float[Array, "*batch token dim"]
 
 @brief
 class BlockShape(NamedTuple):
-    """The sizes of the block that an adapter is built for."""
+    """The sizes of the transformer block that an adapter is built for."""
 
     dim: int
     """Width of a token."""
@@ -28,24 +28,24 @@ class BlockShape(NamedTuple):
 
 @brief
 class TokenInfo(NamedTuple):
-    """Information about the tokens that a hook receives."""
+    """Information about the tokens that a hook of an `Adapter` receives."""
 
     grid: Grid
-    """Rows and columns of patches, the last `grid[0] * grid[1]` tokens."""
+    """Rows and columns of patches, which are the last `grid[0] * grid[1]` tokens before padding."""
     length: int | None = None
-    """Number of leading non-padding tokens; None means all."""
+    """Number of tokens before the padding; None means that there is no padding."""
     valid: Valid = None
-    """Mask of the training images whose statistics the batch norms use
-    (`layers.train_batch_norm`); None uses the stored statistics."""
+    """Mask of the training images whose statistics batch norms use (`layers.train_batch_norm`);
+    None, outside training, uses the stored statistics."""
 
 
 class Adapter(Part, abc.ABC):
     """Small layers added to every block: a frozen dataclass whose fields are its settings.
 
-    Implement `init` and at least one of the hooks below it. A hook returns an update that is added
-    to the result of one part of the block, with the shape and dtype of that result; None adds
-    nothing. All blocks have the same shape and run in one loop (`jax.lax.scan`). A hook therefore
-    gets the parameters of a single block, and does the same in every block that has an adapter.
+    Implement `init` and at least one of the hooks (`HOOKS`). Most return an update that is added to
+    the result of one part of the block, with the shape and dtype of that result; None adds nothing.
+    All blocks have the same shape and run in one loop (`jax.lax.scan`). A hook therefore gets the
+    parameters of a single block, and does the same in every block that has an adapter.
 
     Example:
         >>> import jax
@@ -65,14 +65,14 @@ class Adapter(Part, abc.ABC):
     last = None  # not annotated, so that a subclass can make it a field
     """Number of final blocks that have the adapter; None means all."""
     paths = 1  # not annotated either
-    """Number of side paths of an adapter with a `side_path`. Above 1, `init` returns a tuple of the
-    parameters of each path, and `FeatureSpec.path` selects the one that runs."""
+    """Number of side paths of an adapter with a `side_path`. Above 1, `init` returns a tuple with
+    the parameters of each path, and `FeatureSpec.path` selects the path that runs."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:
         """Draw the parameters of one block's adapter, a pytree of float32 arrays.
 
-        To leave a pretrained model unchanged at first, return parameters that make the update 0.
+        To leave a pretrained model unchanged at first, return parameters that make updates 0.
         """
 
     def check(self, shape: BlockShape) -> None:
@@ -99,13 +99,13 @@ class Adapter(Part, abc.ABC):
         return None
 
     def merge(self, params: Any, name: str, layer: Linear) -> Linear:
-        """Return a linear layer with `linear_update` folded into its weights (`merge_adapters`).
+        """Return a linear layer with `linear_update` folded into its weights, for `merge_adapters`.
 
         An adapter with this method must not affect the block in any other way.
 
         Args:
             params: from `init`.
-            name: see `linear_update`.
+            name: name of the layer, one of `BlockShape.linears`.
             layer: the linear layer.
         """
         raise NotImplementedError
@@ -129,11 +129,11 @@ class Adapter(Part, abc.ABC):
 
         Args:
             params: from `init`.
-            tokens: normalised input of the MLP.
+            tokens: input of the MLP, after the layer norm.
             info: describes these tokens.
 
         Returns:
-            (update, updated): the second is the parameters, with any running statistics updated.
+            (update, updated): the second is `params` with any running statistics updated.
         """
         return None, params
 
@@ -150,26 +150,26 @@ class Adapter(Part, abc.ABC):
     def side_path(
         self, params: Any, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, Any]:
-        """Return a side path's tokens after a block; the backbone outputs those after the last.
+        """Return a side path's tokens after a block; the last block's are the backbone's output.
 
         The path starts from the tokens that enter the first block with an adapter.
 
         Args:
             params: parameters of this path, from `init`.
-            side: tokens of the path.
+            side: tokens of the path before the block.
             tokens: output of the block.
-            info: describes these tokens.
+            info: describes the tokens.
 
         Returns:
-            (side, updated): the new tokens of the path, and the parameters as in `mlp_update`.
+            (side, updated): the path's tokens after the block, and `params` as in `mlp_update`.
         """
         raise NotImplementedError
 
     def has(self, *hooks: str) -> bool:
-        """Return whether the class overrides at least one of these methods."""
+        """Return whether the class overrides at least one of the methods with these names."""
         return any(getattr(type(self), hook) is not getattr(Adapter, hook) for hook in hooks)
 
 
 HOOKS = ("prompts", "linear_update", "attention_update", "mlp_update", "output_update", "side_path")
-"""Adapter methods that change the computation of a block."""
+"""Names of the `Adapter` methods that change the computation of a block."""
 ADAPTERS = Registry("adapter", Adapter)

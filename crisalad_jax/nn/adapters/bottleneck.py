@@ -41,7 +41,7 @@ CONV_INIT = 1e-5
 
 @pytree_dataclass
 class DepthwiseAdapter:
-    """The paper's adapter, whose down-projection has no bias: 741,504 parameters (Table 3)."""
+    """Parameters of the paper's adapter, without a bias of `down`: 741,504 in ViT-B (Table 3)."""
 
     down: Linear
     depthwise: DepthwiseConv
@@ -51,7 +51,7 @@ class DepthwiseAdapter:
 
 @pytree_dataclass
 class MultiResolutionAdapter:
-    """CricaVPR's parallel 1 x 1, 3 x 3 and 5 x 5 convolutions, the last two after a reduction."""
+    """CricaVPR's parallel convolutions: 1 x 1, and 3 x 3 and 5 x 5 after a 1 x 1 reduction."""
 
     down: Linear
     branch1: ConvNorm
@@ -70,7 +70,7 @@ class MlpAdapter:
 
 @pytree_dataclass
 class SerialParallelAdapter:
-    """SelaVPR's adapters (Lu et al. 2024): after the attention with a skip; parallel to the MLP."""
+    """SelaVPR's MLPs (Lu et al. 2024): after the attention, with a skip; parallel to the MLP."""
 
     serial: MlpAdapter
     parallel: MlpAdapter
@@ -78,7 +78,7 @@ class SerialParallelAdapter:
 
 @ADAPTERS.register("none")
 class NoAdapter(Adapter):
-    """No adapter: the plain backbone."""
+    """No adapter: the backbone runs as it is."""
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> None:
         """Return None: there are no parameters."""
@@ -93,9 +93,9 @@ class BottleneckAdapter(Adapter):
     """Base class of bottleneck adapters."""
 
     width_factor: ClassVar[int] = 1
-    """The width of the bottleneck must be a multiple of this."""
+    """The width of the bottleneck must be a multiple of this number."""
     bottleneck: PositiveFloat = 0.5
-    """Width of the adapter divided by the backbone's."""
+    """Width of the bottleneck divided by the width of the backbone."""
     alpha: float = 0.2
     """Weight of the adapter's output (paper Eq. 2)."""
 
@@ -140,7 +140,7 @@ class DepthwiseConfig(BottleneckAdapter):
     def mlp_update(
         self, params: DepthwiseAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, DepthwiseAdapter]:
-        """Project down, ReLU, convolve the patches, add the skip, project up (paper Eq. 2)."""
+        """Project down, ReLU, convolve patches, add the skip, project up, scale (paper Eq. 2)."""
         hidden = _project_down(params.down, tokens)
         mixed, _ = _on_patches(lambda x: (_separable(params, x), None), hidden, info)
         return self.alpha * linear(params.up, mixed + hidden), params
@@ -159,7 +159,7 @@ class MultiResolutionConfig(BottleneckAdapter):
     def mlp_update(
         self, params: MultiResolutionAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MultiResolutionAdapter]:
-        """Project down, ReLU, convolve the patches, add the skip, project up."""
+        """Project down, ReLU, convolve the patches, add the skip, project up, scale by alpha."""
         update, updated = _multi_resolution(params, tokens, info)
         return self.alpha * update, updated
 
@@ -175,7 +175,7 @@ class MlpConfig(BottleneckAdapter):
     def mlp_update(
         self, params: MlpAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MlpAdapter]:
-        """Return the output of the MLP, applied to each token independently."""
+        """Return alpha times the output of the MLP, applied to each token independently."""
         return self.alpha * _mlp(params, tokens), params
 
 
@@ -197,7 +197,7 @@ class SerialParallelConfig(BottleneckAdapter):
     def mlp_update(
         self, params: SerialParallelAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, SerialParallelAdapter]:
-        """Return the output of the parallel MLP."""
+        """Return alpha times the output of the parallel MLP."""
         return self.alpha * _mlp(params.parallel, tokens), params
 
 
@@ -205,8 +205,8 @@ class SerialParallelConfig(BottleneckAdapter):
 class SideConfig(BottleneckAdapter):
     """EDTformer's MLPs with GELU, on a side path along all blocks (Jin et al. 2025).
 
-    After each block the tokens of the path become s + alpha MLP(s), where s is their sum with the
-    block's output. No gradient passes through the blocks.
+    After each block the tokens of the path become s + alpha MLP(s), where s is the sum of these
+    tokens and the block's output. No gradient passes through the blocks.
     """
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> MlpAdapter:
@@ -216,7 +216,7 @@ class SideConfig(BottleneckAdapter):
     def side_path(
         self, params: MlpAdapter, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MlpAdapter]:
-        """Add the output of the MLP."""
+        """Return s + alpha MLP(s) for s, the path's tokens plus the block's output."""
         total = tokens + side
         return _sum(total, self.alpha, _mlp(params, total, gelu)), params
 
@@ -225,15 +225,15 @@ class SideConfig(BottleneckAdapter):
 class SideMultiResolutionConfig(BottleneckAdapter):
     """SelaVPR++'s adapters: CricaVPR's convolutions on side paths (Lu et al. 2025).
 
-    After each block the tokens s of a path become s + alpha A(s + x), where x is the block's
-    output. No gradient passes through the blocks.
+    After each block the tokens s of a path become s + alpha A(s + x), where x is the output of the
+    block and A the unscaled `multi-resolution` adapter. No gradient passes through the blocks.
     """
 
     width_factor: ClassVar[int] = MultiResolutionConfig.width_factor
     alpha: float = 1.0
     """Weight of the adapter's output."""
     last: PositiveInt | None = None
-    """Number of final blocks that have it; None means all. SelaVPR++'s ViT-L has 16."""
+    """Number of final blocks that have the adapter; None means all. SelaVPR++'s ViT-L has 16."""
     paths: PositiveInt = 1
     """Number of side paths: 2 if the second is for binary descriptors."""
 
@@ -245,7 +245,7 @@ class SideMultiResolutionConfig(BottleneckAdapter):
     def side_path(
         self, params: MultiResolutionAdapter, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MultiResolutionAdapter]:
-        """Add the convolutions of the path's tokens plus the block's output."""
+        """Return s + alpha A(s + x) for the path's tokens s and the block's output x."""
         update, updated = _multi_resolution(params, tokens + side, info)
         return _sum(side, self.alpha, update), updated
 

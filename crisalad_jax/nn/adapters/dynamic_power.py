@@ -1,4 +1,4 @@
-"""SAGE's dynamic power (ICLR 2026): all elements of a block's output are raised to one power.
+"""SAGE's dynamic power (ICLR 2026): a block's output, plus its elements raised to one power.
 
 Written from facts about the public model; the training code is not published.
 """
@@ -12,22 +12,22 @@ from crisalad_jax.nn.layers import TwoLayer, init_two_layer, powers
 
 @ADAPTERS.register("dynamic-power")
 class DynamicPowerConfig(Adapter):
-    """SAGE's dynamic power after each of the last blocks: x + sign(x) (|x| + 1e-6)^p.
+    """SAGE's dynamic power, which turns the output x of a block into x + sign(x) (|x| + 1e-6)^p.
 
     A small network computes an image's exponent p, between 0 and 1, from the mean of all tokens.
     The power is discontinuous at 0, so values near 0 are sensitive to rounding.
     """
 
     last: PositiveInt | None = 4
-    """Number of final blocks that have it; None means all."""
+    """Number of final blocks that have the power; None means all."""
     hidden: PositiveInt = 16
-    """Width of the network."""
+    """Width of the hidden layer of the network that computes the exponent."""
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> TwoLayer:
-        """Draw the network as torch draws linear layers."""
+        """Draw the network of the exponent as torch draws linear layers."""
         return init_two_layer(key, shape.dim, self.hidden, 1)
 
     def output_update(self, params: TwoLayer, tokens: AnyTokens, info: TokenInfo) -> AnyTokens:
-        """Return the powers of the tokens."""
+        """Return sign(x) (|x| + 1e-6)^p for the tokens x, with one exponent p per image."""
         mean = tokens[..., : info.length, :].mean(axis=-2, keepdims=True)
         return powers(params, tokens, mean)

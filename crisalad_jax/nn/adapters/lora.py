@@ -16,7 +16,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class LowRank:
-    """The factors of an update: `down` is the paper's A transposed, `up` its B transposed."""
+    """The factors of an update: the paper's A transposed (`down`), and its B transposed (`up`)."""
 
     down: Linear
     up: Linear
@@ -26,16 +26,16 @@ class LowRank:
 class LoraConfig(Adapter):
     """Low-rank updates of linear layers, W x + alpha / rank B A x (LoRA: Hu et al. 2021).
 
-    There is no dropout. `merge_adapters` adds the products to the weights for inference.
+    There is no dropout. `merge_adapters` adds alpha / rank B A to W for inference.
     """
 
     rank: PositiveInt = 8
     """Rank of the updates."""
     alpha: PositiveFloat = 8.0
-    """Updates are scaled by alpha / rank."""
+    """Updates are scaled by alpha divided by the rank."""
     layers: tuple[Literal["qkv", "proj", "fc1", "fc2", "w12", "w3"], ...] = ("qkv", "proj")
-    """Layers with an update: qkv and proj of the attention, fc1 and fc2 of the MLP, w12 and w3 of a
-    SwiGLU."""
+    """Layers with an update: qkv and proj of the attention, fc1 and fc2 of the MLP, or w12 and w3
+    of a SwiGLU."""
 
     def check(self, shape: BlockShape) -> None:
         """Require that the block has these layers and that each is named once."""
@@ -55,14 +55,14 @@ class LoraConfig(Adapter):
     def linear_update(
         self, params: dict[str, LowRank], name: str, x: Float[Array, "*batch d_in"]
     ) -> Float[Array, "*batch d_out"] | None:
-        """Return the scaled x A B, without computing A B or a gradient of its size."""
+        """Return alpha / rank B A x, or None for other layers; no array has the size of B A."""
         if name not in params:
             return None
         hidden = keep(linear(params[name].down, x), "down")
         return self.alpha / self.rank * linear(params[name].up, hidden)
 
     def merge(self, params: dict[str, LowRank], name: str, layer: Linear) -> Linear:
-        """Add the scaled product A B to the weight."""
+        """Return the layer with alpha / rank B A added to its weight."""
         if name not in params:
             return layer
         product = jnp.matmul(params[name].down.weight, params[name].up.weight, precision="highest")

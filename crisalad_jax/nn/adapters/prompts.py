@@ -1,4 +1,4 @@
-"""Visual prompts: learnt tokens in addition to an image's own (Jia et al., ECCV 2022)."""
+"""Visual prompts: learnt tokens in addition to those of an image (Jia et al., ECCV 2022)."""
 
 import math
 
@@ -12,7 +12,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class Prompts:
-    """The prompts of a block."""
+    """The parameters: the prompts of a block, as they enter it."""
 
     tokens: Float[Array, "*stack prompt dim"]
 
@@ -21,8 +21,8 @@ class Prompts:
 class PromptsConfig(Adapter):
     """Prompts in every block (VPT-deep: Jia et al., ECCV 2022), without dropout.
 
-    The tokens of an image attend to the block's prompts, whose own outputs are dropped. Each prompt
-    adds a token to the attention. Unlike other adapters, untrained prompts change the descriptors.
+    The tokens of an image attend to a block's prompts, whose outputs are dropped. Each prompt adds
+    a token to the attention. Unlike other adapters, untrained prompts change the descriptors.
     """
 
     count: PositiveInt = 10
@@ -35,5 +35,5 @@ class PromptsConfig(Adapter):
         return Prompts(tokens)
 
     def prompts(self, params: Prompts) -> Float[Array, "prompt dim"]:
-        """Return the prompts."""
+        """Return the prompts of a block."""
         return params.tokens

@@ -1,4 +1,4 @@
-"""Aggregators, which turn features into tokens: one module for each method of docs/methods.md."""
+"""Aggregators, which turn features into tokens; docs/methods.md lists the methods."""
 
 import importlib
 import pkgutil

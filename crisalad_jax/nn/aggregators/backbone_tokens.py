@@ -37,7 +37,7 @@ class ClassTokenConfig(Aggregator):
 
 @pytree_dataclass
 class AggregationTokens:
-    """The tokens as they enter the backbone's blocks."""
+    """The parameters: the learnt tokens, as they enter the backbone's blocks."""
 
     tokens: Float[Array, "token dim"]
 
@@ -57,10 +57,10 @@ class AggregationTokensConfig(Aggregator):
     tokens: PositiveInt = 8
     """Number of learnt tokens."""
     insertion: int = -4
-    """Block before which they are prepended to all others, from 0, or from the end if negative."""
+    """Block before which the learnt tokens are prepended: its index, from the end if negative."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request that the tokens run through the blocks from `insertion` on.
+        """Request that the learnt tokens run through the blocks from `insertion` on.
 
         Raises:
             InputError: there is no such block.
@@ -69,24 +69,24 @@ class AggregationTokensConfig(Aggregator):
         return FeatureSpec(insertion=self.insertion % depth)
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of the tokens."""
+        """Return the shape of the learnt tokens, as local tokens as wide as the backbone."""
         return TokenShape(0, self.tokens, dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> AggregationTokens:
-        """Draw tokens with deviation 1e-6, as published; `from_centroids` replaces them."""
+        """Draw tokens with standard deviation 1e-6, as published; see also `from_centroids`."""
         return AggregationTokens(random_init.normal(key, (self.tokens, backbone.dim), scale=1e-6))
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> AggregationTokens:
-        """Make tokens as the authors do: centroids scaled like NetVLAD's initial score weights."""
+        """Make tokens as the authors do: centroids, scaled like NetVLAD's initial score weights."""
         return AggregationTokens(scores_from_centroids(centroids, features).weight.T)
 
     def inserted(self, params: AggregationTokens) -> Float[Array, "token dim"]:
-        """Return the tokens."""
+        """Return the learnt tokens."""
         return params.tokens
 
     def apply(
         self, params: AggregationTokens, features: Features, grid: Grid, *, key: Keys
     ) -> Tokens:
-        """Return the tokens after the backbone's last layer norm."""
+        """Return the learnt tokens after the last block and layer norm, as local tokens."""
         assert features.inserted is not None
         return Tokens.of_local(at_least_float32(features.inserted))

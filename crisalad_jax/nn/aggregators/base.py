@@ -41,8 +41,8 @@ class TokenShape(NamedTuple):
 class Aggregator(Part, abc.ABC):
     """A method that turns features into tokens: a frozen dataclass whose fields are its settings.
 
-    Implement `token_shape` and `apply`. A plain function of one image's `Features` that returns a
-    vector, or a matrix of token vectors, works as an aggregator without parameters.
+    Implement `token_shape` and `apply`. An aggregator without parameters can also be a function
+    from the `Features` of one image to a vector, or to a matrix with a token in each row.
 
     Example:
         >>> from crisalad_jax import ModelConfig, register_aggregator
@@ -60,30 +60,30 @@ class Aggregator(Part, abc.ABC):
     """
 
     flatten_order: ClassVar[FlattenOrder] = "token-first"
-    """Order of a descriptor's dimensions: token by token, or the first dimension of all local
+    """Order of the local tokens in a descriptor: token by token, or the first dimension of all
     tokens, then their second, and so on."""
     trainable: ClassVar[bool] = True
-    """Whether its parameters train; if not, no part of the model trains."""
+    """Whether the aggregator's parameters train; if not, no part of the model does."""
     fixed_grid: ClassVar[bool] = False
-    """Whether its parameters fit only one image size."""
+    """Whether the aggregator's parameters fit only one image size."""
     centroid_images: ClassVar[int] = 500
     """Maximum number of training images from whose features the initial centroids are computed."""
     spherical_centroids: ClassVar[bool] = False
     """Whether k-means compares features with centroids by angle instead of distance. Either way a
     centroid is the mean of its features."""
     class_token: ClassVar[bool] = False
-    """Whether it uses the backbone's class token, with the last block's patches."""
+    """Whether `features` by default requests the class token too; not every backbone has one."""
 
     def numbers(self, params: Any) -> Mapping[str, Any]:
-        """Return values of the parameters to log by name at each validation; by default none."""
+        """Return values to log at each validation, by name; by default none."""
         return {}
 
     @abc.abstractmethod
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of an image's tokens for features of width `dim`."""
+        """Return the shape of the tokens of an image whose features have width `dim`."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Return features to request from a backbone of this depth; by default the last block's.
+        """Return features to request from a backbone of `depth` blocks; by default the last one's.
 
         Raises:
             InputError: the backbone has too few blocks.
@@ -103,7 +103,7 @@ class Aggregator(Part, abc.ABC):
     def inserted(self, params: Any) -> Float[Array, "inserted dim"] | None:
         """Return additional tokens to run through the backbone's blocks; by default None.
 
-        `features` sets the block after which they are inserted; `Features.inserted` holds them.
+        `FeatureSpec.insertion` from `features` says where; `Features.inserted` has their outputs.
         """
         return None
 
@@ -113,40 +113,40 @@ class Aggregator(Part, abc.ABC):
 
         Args:
             params: from `init`.
-            features: the requested features.
+            features: the features that `features` requested.
             grid: rows and columns of patches.
-            key: random key for dropout, one for all images or for each; None means inference.
+            key: random key for dropout, one for all images or for each; None for inference.
         """
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
         """Raise InputError if an image with this grid is too small; by default, accept any grid."""
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Any:
-        """Make parameters from k-means centroids of unit features.
+        """Make parameters from k-means centroids of features.
 
-        Only aggregators with `starts_from_centroids` implement it.
+        Aggregators that implement this have `starts_from_centroids`.
 
         Args:
-            centroids: k-means centroids of `centroid_features`.
-            features: unit features.
+            centroids: k-means centroids of what `centroid_features` returns.
+            features: the features, scaled to unit length, before `centroid_features`.
         """
         raise NotImplementedError
 
     def with_frequencies(self, params: Any, images: Sequence[Any]) -> Any:
-        """Weight the centroids by how many images contain each; by default return `params`.
+        """Weight the centroids by how many images contain each of them; by default, do nothing.
 
         Args:
             params: from `from_centroids`.
-            images: unit features of each image, (feature, dim).
+            images: an array of unit features, (feature, dim), for each image.
         """
         return params
 
     def centroid_features(self, features: FeatureRows) -> Float[Array, "feature reduced"]:
-        """Return the features to cluster by k-means; by default the unit features themselves."""
+        """Return what k-means clusters, given unit features; by default these themselves."""
         return features
 
     def count_centroids(self, dim: int) -> int:
-        """Return the number of centroids that `from_centroids` takes, for features of width `dim`.
+        """Return how many centroids `from_centroids` takes, for features of width `dim`.
 
         By default there is one for each local token.
         """
@@ -154,7 +154,7 @@ class Aggregator(Part, abc.ABC):
 
     @property
     def starts_from_centroids(self) -> bool:
-        """Whether it has a vocabulary, which must be built before the model is used or trained."""
+        """Whether it has a vocabulary (centroids) to build before the model is used or trained."""
         return type(self).from_centroids is not Aggregator.from_centroids
 
     @property
@@ -163,10 +163,10 @@ class Aggregator(Part, abc.ABC):
         return type(self).plan is not Aggregator.plan
 
     def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"]:
-        """Return the mass that a transport sends from each patch to each cluster.
+        """Return the mass that an optimal transport sends from each patch to each cluster.
 
-        A patch sends a mass of 1. If there is a dustbin, it is the last column. Only aggregators
-        with `transports` implement this.
+        A patch sends a mass of 1. A dustbin, for patches without a cluster, is the last column.
+        Aggregators that implement this have `transports`; others raise InputError.
         """
         raise InputError(
             f"aggregator: found {self.part_name}, expected one that transports, such as salad"
@@ -180,10 +180,10 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
         tokens: what `apply` returned.
         aggregator: the aggregator that returned them.
         dim: width of the features.
-        batch: shape of the batch.
+        batch: leading axes of the tokens, () for a single image.
 
     Raises:
-        InputError: they do not match; the message names the aggregator.
+        InputError: the shapes or types do not match; the message names the aggregator.
     """
     shape = TokenShape(*aggregator.token_shape(dim))
     wide = jnp.result_type(jnp.float32, *jax.tree.leaves(tokens))
@@ -195,10 +195,10 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
 
 
 def require_side(name: str, grid: Grid, regions: int, patch_size: int) -> None:
-    """Check that each side of the grid has a patch for every region.
+    """Check that each side of a patch grid has at least as many patches as `regions`.
 
     Raises:
-        InputError: a side has fewer patches than regions.
+        InputError: a side has fewer; the message has pixels, and `name` as the aggregator.
     """
     side = regions * patch_size
     height, width = (patch_size * each for each in grid)
@@ -212,7 +212,7 @@ def require_side(name: str, grid: Grid, regions: int, patch_size: int) -> None:
 def regions(
     patches: Patches, grid: Grid, rows: Iterable[Cut], columns: Iterable[Cut]
 ) -> list[Float[Array, "*batch _ _ dim"]]:
-    """Cut the patch grid into regions, in row order; each cut is (first, last + 1)."""
+    """Cut the patch grid into regions, in row order; `rows` and `columns` are half-open ranges."""
     columns = list(columns)
     cells = patches.reshape(*patches.shape[:-2], *grid, patches.shape[-1])
     return [
@@ -256,7 +256,7 @@ AGGREGATORS = Registry("aggregator", Aggregator, of_function=_of_function)
 
 
 def to_descriptor(tokens: Tokens, aggregator: Aggregator) -> Float[Array, "*batch descriptor"]:
-    """Return unit descriptors: the global token, then the local ones in the published order."""
+    """Return unit descriptors: the global token, then the local ones by `flatten_order`."""
     local = tokens.local
     if aggregator.flatten_order == "dimension-first":
         local = local.swapaxes(-2, -1)

@@ -22,7 +22,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class ConvAp:
-    """The 1 x 1 convolution, a linear layer applied to every patch."""
+    """The parameters: a 1 x 1 convolution, which is a linear layer applied to every patch."""
 
     channel_pool: Linear
 
@@ -33,12 +33,12 @@ class ConvApConfig(Aggregator):
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     channels: PositiveInt = 1024
-    """Channels of the 1 x 1 convolution."""
+    """Number of output channels of the 1 x 1 convolution."""
     side: PositiveInt = 2
-    """Number of regions along each side; means are taken over side x side regions."""
+    """Number of regions along each side of the image; side x side means form the descriptor."""
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of one mean for each region."""
+        """Return the shape of one local token, a mean, for each region."""
         return TokenShape(0, self.side**2, self.channels)
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
@@ -52,8 +52,8 @@ class ConvApConfig(Aggregator):
     def apply(self, params: ConvAp, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token for each of side x side regions, row by row.
 
-        The published order is convolution, then means. Both are linear and the weights of a mean
-        add up to 1, so the order does not matter. Taking the means first makes the convolution
+        The published order is convolution, then means. As the two are linear, and the weights of a
+        mean add up to 1, the order does not matter. Taking means first makes the convolution
         cheaper, by the ratio of patches to regions.
         """
         means = adaptive_means(at_least_float32(features.patches), grid, self.side)
@@ -64,8 +64,8 @@ class ConvApConfig(Aggregator):
 def adaptive_means(patches: Patches, grid: Grid, side: int) -> Float[Array, "*batch region dim"]:
     """Average the patches over side x side regions, as torch's `AdaptiveAvgPool2d` cuts them.
 
-    Region i of a side of n patches goes from floor(i n / side) to ceil((i + 1) n / side): if
-    `side` does not divide n, neighbours share a row or column.
+    Along n patches, region i goes from floor(i n / side) up to but not including
+    ceil((i + 1) n / side): if `side` does not divide n, neighbours share a row or column.
     """
     cuts = ([(i * n // side, -(-(i + 1) * n // side)) for i in range(side)] for n in grid)
     return jnp.stack([each.mean(axis=(-3, -2)) for each in regions(patches, grid, *cuts)], axis=-2)

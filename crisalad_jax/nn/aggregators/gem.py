@@ -1,4 +1,4 @@
-"""Generalised means of patches (GeM): of an image, of a pyramid, and heads with a linear layer."""
+"""Generalised means (GeM) of patches: of an image, of regions, and heads with a linear layer."""
 
 import itertools
 import math
@@ -25,14 +25,14 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 GEM_FLOOR = 1e-6
 """Lower bound of the values in a generalised mean, because negative ones have no real power."""
 START = 3.0
-"""Initial exponent of public implementations."""
+"""Initial exponent, as in public implementations."""
 PYRAMID_LEVELS = (2, 3)
-"""Regions along a side, as in CricaVPR: 4 and 9 in all."""
+"""Number of regions along a side on each level, as in CricaVPR: 4 and 9 regions in all."""
 
 
 @pytree_dataclass
 class Gem:
-    """The exponent of the mean, one for all channels: 1 is the mean, infinity the maximum."""
+    """The exponent of the mean, one for all channels; 1 gives the mean, infinity the maximum."""
 
     p: Float[Array, ""]
 
@@ -50,7 +50,7 @@ class GemConfig(Aggregator):
         return Gem(random_init.full((), START))
 
     def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the mean of all patches, a global token as wide as the backbone."""
+        """Return the generalised mean of all patches, a global token as wide as the backbone."""
         return Tokens.of_global(gem(features.patches, params.p))
 
 
@@ -64,7 +64,7 @@ class GemPyramidConfig(GemConfig):
     class_token: ClassVar[bool] = True
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of tokens as wide as the backbone."""
+        """Return the shape of a global and 13 local tokens, all as wide as the backbone."""
         return TokenShape(dim, sum(level**2 for level in PYRAMID_LEVELS), dim)
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
@@ -72,7 +72,7 @@ class GemPyramidConfig(GemConfig):
         require_side(self.part_name, grid, max(PYRAMID_LEVELS), patch_size)
 
     def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the class token, and a generalised mean for each region."""
+        """Return the class token as the global one, and the mean of each region as a local one."""
         means = gem_pyramid(features.patches, params.p, grid)
         return Tokens(at_least_float32(features.class_token), means)
 
@@ -90,20 +90,20 @@ class CosPlaceConfig(Aggregator):
     """The head of CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023)."""
 
     dim: PositiveInt = 512
-    """Width of the descriptor: CosPlace's 512, EigenPlaces' 2,048."""
+    """Width of the descriptor: 512 in CosPlace, 2,048 in EigenPlaces."""
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token."""
         return TokenShape(self.dim, 0, self.dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> CosPlace:
-        """Draw parameters as the public code does: exponent 3, torch's default linear layer."""
+        """Draw parameters as the public code does: an exponent of 3, and torch's linear layer."""
         return CosPlace(random_init.full((), START), init_linear(key, backbone.dim, self.dim))
 
     def apply(self, params: CosPlace, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Apply a linear layer to the generalised mean of unit patches.
 
-        The descriptor is scaled to unit length later.
+        The output is scaled to unit length only later, when it becomes the descriptor.
         """
         mean = gem(features.patches, params.p).astype(features.patches.dtype)
         return Tokens.of_global(at_least_float32(linear(params.fc, mean)))
@@ -117,7 +117,7 @@ class Whitening:
     components: Float[Array, "dim dim"]
     """Orthonormal rows."""
     variance: Float[Array, " dim"]
-    """Variance of the fitted descriptors along the components."""
+    """Variance of the fitted descriptors along each component."""
 
 
 @pytree_dataclass
@@ -131,21 +131,21 @@ class ApGem:
 
 @AGGREGATORS.register("ap-gem", tiny={"dim": 256})
 class ApGemConfig(CosPlaceConfig):
-    """The head of AP-GeM (Revaud et al., ICCV 2019), with its whitening."""
+    """The head of AP-GeM (Revaud et al., ICCV 2019), with the whitening of its public code."""
 
     dim: PositiveInt = 2048
     """Width of the linear layer and of the descriptor."""
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> ApGem:
-        """Draw parameters as in CosPlace, with the identity as whitening."""
+        """Draw parameters as in CosPlace, with a whitening that does nothing."""
         head, zeros, ones = super().init(key, backbone, grid), random_init.zeros, random_init.ones
         whitening = Whitening(zeros(self.dim), jnp.diag(ones(self.dim)), ones(self.dim))
         return ApGem(head.p, head.fc, whitening)
 
     def apply(self, params: ApGem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Apply a linear layer to the mean of raw patches, then normalise and whiten the output.
+        """Apply a linear layer to the generalised mean of raw patches; normalise, then whiten.
 
-        The whitening is measured, not learnt: it gets no gradient.
+        The whitening comes from statistics and is not learnt, so it gets no gradient.
         """
         patches = features.patches
         mean = generalised_mean(log_floored(patches), params.p, axes=(-2,)).astype(patches.dtype)
@@ -154,27 +154,27 @@ class ApGemConfig(CosPlaceConfig):
 
 
 def whiten(params: Whitening, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
-    """Divide components by variance^(1/4), as the evaluation of the public code does."""
+    """Project onto the components, each divided by variance^(1/4), as AP-GeM's public code does."""
     components = jnp.matmul(x - params.mean, params.components.T, precision="highest")
     return components * params.variance**-0.25
 
 
 def gem(patches: Patches, p: Float[Array, ""]) -> Float[Array, "*batch dim"]:
-    """Compute the generalised mean of all unit patches, in at least float32."""
+    """Compute the generalised mean, in at least float32, of all patches scaled to unit length."""
     return generalised_mean(log_units(patches), p, axes=(-2,))
 
 
 def log_units(patches: Patches) -> Patches:
-    """Compute the logarithms of unit patches, with values clamped to the floor.
+    """Scale patches to unit length; return the logarithms of values clamped to `GEM_FLOOR`.
 
     CosPlace, CricaVPR and the benchmark of Berton et al. (CVPR 2022) use the same normalisation
-    and floor. The result is at least float32.
+    and floor. The result is in at least float32.
     """
     return log_floored(l2_normalise(at_least_float32(patches)))
 
 
 def log_floored(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Compute logarithms of values clamped to the floor, in at least float32."""
+    """Compute the logarithms, in at least float32, of values clamped to `GEM_FLOOR`."""
     return jnp.log(jnp.maximum(at_least_float32(x), GEM_FLOOR))
 
 
@@ -183,8 +183,8 @@ def generalised_mean(
 ) -> Float[Array, "*rest"]:
     """Compute (mean of x^p)^(1/p) along `axes` from the logarithms of x (Radenovic et al., Eq. 3).
 
-    Logarithms avoid underflow: in float32 the floor's power is 0 from an exponent of 6.4 on, and a
-    mean of zeros has no gradient.
+    Logarithms avoid underflow: in float32 the power of `GEM_FLOOR` is 0 for exponents from 6.4 on,
+    and a mean of zeros has no gradient.
     """
     count = math.prod(logs.shape[i] for i in axes)
     return jnp.exp((jax.nn.logsumexp(p * logs, axis=axes) - math.log(count)) / p)
@@ -195,8 +195,8 @@ def gem_pyramid(
 ) -> Float[Array, "*batch region dim"]:
     """Compute generalised means (Radenovic et al. 2018) of unit patches in 2 x 2 and 3 x 3 regions.
 
-    Regions come level by level in row order. A side of n patches is cut at round(i n / level). For
-    CricaVPR's fixed 16 x 16 grid this gives its published cuts at 8, and at 5 and 11.
+    Regions come level by level in row order. With k regions along a side, n patches are cut at
+    round(i n / k): for CricaVPR's fixed 16 x 16 grid at its published 8, and 5 and 11.
     """
     logs, means = log_units(patches), []
     for level in PYRAMID_LEVELS:

@@ -29,7 +29,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class FeatureMixer:
-    """A layer norm and a network of one hidden layer, along the patches of each channel."""
+    """A layer norm and an MLP with one hidden layer, both over the patches of each channel."""
 
     norm: LayerNorm
     fc1: Linear
@@ -38,7 +38,7 @@ class FeatureMixer:
 
 @pytree_dataclass
 class MixVpr:
-    """The mixers in order, then the projections to fewer channels and fewer rows."""
+    """Parameters: the mixers in order, then the projections of the channels and of the patches."""
 
     mix: tuple[FeatureMixer, ...]
     channel_proj: Linear
@@ -52,27 +52,27 @@ class MixVprConfig(Aggregator):
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     fixed_grid: ClassVar[bool] = True
     channels: PositiveInt = 1024
-    """Number of channels after the projection."""
+    """Number of channels after their linear projection."""
     rows: PositiveInt = 4
-    """Number of values of each channel after the projection."""
+    """Number of values (rows) that the patches of each channel are projected to."""
     depth: PositiveInt = 4
-    """Number of feature mixers, each as wide as there are patches."""
+    """Number of feature mixers, whose layers are as wide as the number of patches."""
     last_norm: bool = True
-    """Whether the backbone's last layer norm is applied. In DINO-Mix it is not."""
+    """Whether the backbone's last layer norm is applied; DINO-Mix does not apply it."""
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the patches of the last block."""
         return FeatureSpec(norm=self.last_norm)
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of one token for each row."""
+        """Return the shape of `rows` local tokens of width `channels`, without a global token."""
         return TokenShape(0, self.rows, self.channels)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> MixVpr:
         """Draw parameters as the public implementation does.
 
-        Mixers have zero biases and normal weights of deviation 0.02. (The public code truncates
-        them at 100 deviations, which has no effect.) Projections are torch's linear layers.
+        Mixers have normal weights of standard deviation 0.02 and zero biases. (The public code also
+        truncates at 100 deviations, without effect.) Projections are drawn like `nn.Linear`.
         """
         mixers, channels, rows = random_init.split(key, 3)
         patches = math.prod(grid)
@@ -86,7 +86,7 @@ class MixVprConfig(Aggregator):
         )
 
     def apply(self, params: MixVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return a token of width `channels` for each row (paper Eqs. 1 to 4)."""
+        """Return `rows` local tokens of width `channels` (Eqs. 1 to 4), in at least float32."""
         maps = features.patches.swapaxes(-2, -1)
         for mixer in params.mix:
             hidden = linear(mixer.fc1, layer_norm(mixer.norm, maps))

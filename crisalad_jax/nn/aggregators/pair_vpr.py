@@ -1,4 +1,4 @@
-"""Pair-VPR (Hausler and Moghadam, RA-L 2025): a projected class token, and a decoder of pairs.
+"""Pair-VPR (Hausler and Moghadam, RA-L 2025): a projected class token, and a decoder for pairs.
 
 Written from the papers: the decoder is that of CroCo (Weinzaepfel et al., NeurIPS 2022).
 """
@@ -38,7 +38,7 @@ _norm = functools.partial(layer_norm, epsilon=NORM_EPSILON)
 
 @pytree_dataclass
 class PairLayer:
-    """Self-attention of an image's tokens, cross-attention to the other image's, and an MLP."""
+    """Self-attention in the first image, cross-attention to the second image, and an MLP."""
 
     norm1: LayerNorm
     attn: Attention
@@ -47,17 +47,17 @@ class PairLayer:
     norm3: LayerNorm
     mlp: TwoLayer
     norm_other: LayerNorm
-    """Norm of the other image's tokens, which no layer updates."""
+    """Layer norm of the second image's tokens, which no layer updates."""
 
 
 @pytree_dataclass
 class PairVpr:
-    """The linear layer of the descriptor, and the decoder, which descriptors do not need."""
+    """Parameters of the layer that makes descriptors, and of the decoder, which scores pairs."""
 
     cls_token: Float[Array, " width"]
-    """Decoder's class token, which gives the logit."""
+    """Class token of the decoder; its output gives the logit of a pair."""
     positions: Float[Array, "position width"]
-    """Position embeddings of a square grid, in row order; the class token has none."""
+    """Position embeddings of a square grid of patches, in row order; the class token has none."""
     embed: Linear
     layers: tuple[PairLayer, ...]
     norm: LayerNorm
@@ -69,7 +69,7 @@ class PairVpr:
     "pair-vpr", tiny={"dim": 64, "width": 64, "layers": 2, "hidden": 32, "positions": 49}
 )
 class PairVprConfig(Aggregator):
-    """Pair-VPR's class token and its second stage's decoder (Hausler and Moghadam, RA-L 2025).
+    """The descriptor of Pair-VPR, and its second stage's decoder (Hausler and Moghadam, RA-L 2025).
 
     Example:
         >>> from crisalad_jax import ModelConfig
@@ -81,13 +81,13 @@ class PairVprConfig(Aggregator):
     dim: PositiveInt = 512
     """Width of the descriptor."""
     width: PositiveInt = 768
-    """Width of the decoder."""
+    """Width of a token in the decoder."""
     layers: PositiveInt = 12
     """Number of decoder layers."""
     hidden: PositiveInt = 512
-    """Hidden width of the network that makes the logit."""
+    """Hidden width of the network that computes the logit of a pair."""
     positions: PositiveInt = 529
-    """Number of position embeddings, a square: 23 x 23 patches of 322 x 322 pixels."""
+    """Number of position embeddings, a square: 529 are 23 x 23 patches of 322 x 322 pixels."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -98,15 +98,15 @@ class PairVprConfig(Aggregator):
 
     @property
     def heads(self) -> int:
-        """Number of heads of every attention in the decoder."""
+        """Number of attention heads in every decoder layer: one for every 64 dimensions."""
         return max(1, self.width // 64)
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of a global token."""
+        """Return the shape of a global token of width `self.dim`, without local tokens."""
         return TokenShape(self.dim, 0, self.dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> PairVpr:
-        """Draw layers as torch does, and tokens with deviation 0.02."""
+        """Draw layers like torch, and class token and positions with standard deviation 0.02."""
         keys = random_init.split(key, 6)
         normal = functools.partial(random_init.normal, scale=0.02)
         return PairVpr(
@@ -132,19 +132,19 @@ class PairVprConfig(Aggregator):
         )
 
     def apply(self, params: PairVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the projected class token, without local tokens."""
+        """Return the projected class token, not normalised, without local tokens."""
         return Tokens.of_global(at_least_float32(linear(params.reduction, features.class_token)))
 
     def logits(
         self, params: PairVpr, first: Patches, second: Patches, grid: Grid
     ) -> Float[Array, "*batch"]:
-        """Compute a logit for each ordered pair of images, which is larger for the same place.
+        """Compute a logit for each ordered pair of images: the larger, the likelier the same place.
 
         Args:
             params: from `init`.
-            first: patches of one image of each pair, from the backbone's last layer norm.
-            second: patches of the other, which `first` attends to.
-            grid: rows and columns of patches of both.
+            first: patches of the first image of each pair, from the backbone's last layer norm.
+            second: the same of the second images, to which `first` attends.
+            grid: rows and columns of patches, the same for all images.
         """
         x, other = (self.with_positions(params, each, grid) for each in (first, second))
         x = self.with_class_token(params, x)
@@ -156,7 +156,7 @@ class PairVprConfig(Aggregator):
     def with_positions(
         self, params: PairVpr, patches: Patches, grid: Grid
     ) -> Float[Array, "*batch patch width"]:
-        """Embed patches for the decoder, with their positions, resized as torch does (bicubic)."""
+        """Embed patches for the decoder, and add positions resized by torch's bicubic filter."""
         side = math.isqrt(self.positions)
         positions = params.positions.reshape(side, side, self.width)
         weights = functools.partial(bicubic_weights, more=0.0)
@@ -167,7 +167,7 @@ class PairVprConfig(Aggregator):
     def with_class_token(
         self, params: PairVpr, x: Float[Array, "*batch patch width"]
     ) -> Float[Array, "*batch token width"]:
-        """Put the decoder's class token in front of the patches."""
+        """Prepend the decoder's class token to the embedded patches."""
         token = jnp.broadcast_to(params.cls_token, (*x.shape[:-2], 1, self.width))
         return jnp.concatenate([token.astype(x.dtype), x], axis=-2)
 
@@ -177,7 +177,7 @@ class PairVprConfig(Aggregator):
         x: Float[Array, "*batch token width"],
         other: Float[Array, "*batch patch width"],
     ) -> Float[Array, "*batch token width"]:
-        """Run a layer of the decoder."""
+        """Update the first images' tokens `x` by one decoder layer; `other` are the second's."""
         x = x + attention(layer.attn, _norm(layer.norm1, x), self.heads)
         memory = _norm(layer.norm_other, other)
         x = x + cross_attention(layer.cross_attn, _norm(layer.norm2, x), memory, self.heads)

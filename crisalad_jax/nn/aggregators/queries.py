@@ -1,7 +1,7 @@
 """Learnt queries that attend to features in transformer layers: BoQ and EDTformer.
 
-Attention and encoder layers are torch's: `nn.MultiheadAttention` and, with ReLU, post-norm and a
-feed-forward network of four times the width, `nn.TransformerEncoderLayer`.
+Attention is torch's `nn.MultiheadAttention`. Encoder layers are `nn.TransformerEncoderLayer` with
+ReLU, post-norm and a feed-forward network of four times the width.
 """
 
 from typing import ClassVar
@@ -51,7 +51,7 @@ class BoqBlock:
 
 @pytree_dataclass
 class Boq:
-    """The channel reduction, the blocks in order, the linear layer from query outputs to rows."""
+    """Parameters of BoQ: channel reduction, blocks in order, and the linear layer over queries."""
 
     proj_c: Conv
     norm_input: LayerNorm
@@ -61,7 +61,7 @@ class Boq:
 
 @AGGREGATORS.register("boq", tiny={"channels": 64, "queries": 16, "rows": 8})
 class BoqConfig(Aggregator):
-    """Bag of queries (Ali-bey et al., CVPR 2024)."""
+    """Bag of queries (BoQ; Ali-bey et al., CVPR 2024)."""
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     channels: PositiveInt = 384
@@ -71,7 +71,7 @@ class BoqConfig(Aggregator):
     layers: PositiveInt = 2
     """Number of blocks, each an encoder layer and its queries."""
     rows: PositiveInt = 32
-    """Number of rows that a linear layer makes of all query outputs."""
+    """Number of local tokens (rows) that a linear layer computes from all query outputs."""
     last_norm: bool = False
     """Whether the backbone's last layer norm is applied. In the public code it is not."""
 
@@ -82,7 +82,7 @@ class BoqConfig(Aggregator):
 
     @property
     def heads(self) -> int:
-        """Number of heads of every attention, as in the public code."""
+        """Number of heads in every attention, one for every 64 channels, as in the public code."""
         return max(1, self.channels // 64)
 
     def features(self, depth: int) -> FeatureSpec:
@@ -90,7 +90,7 @@ class BoqConfig(Aggregator):
         return FeatureSpec(norm=self.last_norm)
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of one token for each row."""
+        """Return the shape of `rows` local tokens of width `channels`, without a global token."""
         return TokenShape(0, self.rows, self.channels)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Boq:
@@ -105,7 +105,7 @@ class BoqConfig(Aggregator):
         )
 
     def apply(self, params: Boq, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return a token of width `channels` for each row."""
+        """Return `rows` local tokens of width `channels`, in float32 at least."""
         patches = features.patches
         maps = patches.reshape(-1, *grid, patches.shape[-1])
         maps = conv(params.proj_c, maps)
@@ -149,7 +149,7 @@ class DecoderLayer:
 
 @pytree_dataclass
 class EdtFormer:
-    """Queries, the linear layer over the backbone's tokens, the decoder, two projections."""
+    """Parameters: queries, linear layer over the backbone's tokens, decoder, two projections."""
 
     queries: Float[Array, "query width"]
     fc: Linear
@@ -178,9 +178,9 @@ class EdtFormerConfig(Aggregator):
     queries: PositiveInt = 64
     """Number of learnt queries."""
     channels: PositiveInt = 256
-    """Number of channels of a projected query output."""
+    """Number of channels of a query output after their linear projection."""
     rows: PositiveInt = 16
-    """Number of rows that a linear layer makes of the outputs."""
+    """Number of local tokens (rows) that a linear layer computes from all query outputs."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -188,11 +188,11 @@ class EdtFormerConfig(Aggregator):
         require_field(self, "width", fits, f"a multiple of the {self.heads} heads")
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of one token for each row."""
+        """Return the shape of `rows` local tokens of width `channels`, without a global token."""
         return TokenShape(0, self.rows, self.channels)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> EdtFormer:
-        """Draw queries with deviation 1e-6, as published, and the rest as torch does.
+        """Draw queries with standard deviation 1e-6, as published, and the rest as torch does.
 
         All layers start identical: torch's `nn.TransformerDecoder` copies the layer it is given.
         """
@@ -214,14 +214,14 @@ class EdtFormerConfig(Aggregator):
         )
 
     def apply(self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return a token of width `channels` for each row."""
+        """Return `rows` local tokens of width `channels`, in float32 at least."""
         answers = decode(params, features, self.heads)
         channels = linear(params.channel_proj, answers).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
 
 
 def decode(params: EdtFormer, features: Features, heads: int) -> Float[Array, "*batch query width"]:
-    """Run the decoder, whose queries attend to the class token and all patches.
+    """Compute the query outputs of the decoder, which attends to the class token and all patches.
 
     The first layer's self-attention does not depend on the images: it runs once per batch.
     """

@@ -1,4 +1,4 @@
-"""SAGE's aggregation (ICLR 2026): clusters without a transport, of features weighted by norm.
+"""SAGE's aggregation (ICLR 2026): soft clusters, without transport, of patches weighted by norm.
 
 Written from facts about the public model; the training code is not published.
 """
@@ -28,7 +28,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class Sage:
-    """The networks over features, and those that compute the weights and the power."""
+    """The networks over features, and those that compute patch weights and the exponent."""
 
     weighting: TwoLayer
     """Network from the L2 norm of a patch to its weight."""
@@ -36,7 +36,7 @@ class Sage:
     cluster_features: TwoLayer
     score: TwoLayer
     power: TwoLayer
-    """Network that computes the exponent."""
+    """Network from an image's mean cluster features to the exponent of `layers.powers`."""
 
 
 @AGGREGATORS.register(
@@ -46,8 +46,8 @@ class SageConfig(Aggregator):
     """SAGE's aggregation (ICLR 2026).
 
     Each cluster is a mean of the patches, weighted by a softmax of their scores, without a dustbin
-    or a transport. The power of the clusters is discontinuous at 0, so values near 0 are sensitive
-    to rounding.
+    or a transport. A signed power of each value is then added to it. This power is discontinuous at
+    0, so values near 0 are sensitive to rounding.
 
     Example:
         >>> from crisalad_jax import ModelConfig
@@ -64,14 +64,14 @@ class SageConfig(Aggregator):
     hidden: PositiveInt = 512
     """Hidden width of the networks over features."""
     weighting_hidden: PositiveInt = 128
-    """Hidden width of the weighting network."""
+    """Hidden width of the network that weights patches by their norm."""
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the tokens' shape, which does not depend on the backbone."""
         return TokenShape(self.token_dim, self.clusters, self.cluster_dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Sage:
-        """Draw parameters as torch's default layers."""
+        """Draw parameters like torch's default linear layers."""
         keys, dim, hidden = random_init.split(key, 5), backbone.dim, self.hidden
         return Sage(
             weighting=init_two_layer(keys[0], 1, self.weighting_hidden, 1),
@@ -82,7 +82,7 @@ class SageConfig(Aggregator):
         )
 
     def apply(self, params: Sage, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the global token and the clusters, each L2-normalised, in float32."""
+        """Return the global token and the clusters, each L2-normalised, in float32 at least."""
         patches = weighted(params.weighting, features.patches)
         means = pooled(params, patches)
         # An image has one exponent for all features of all clusters.
@@ -93,14 +93,14 @@ class SageConfig(Aggregator):
 
 
 def weighted(params: TwoLayer, patches: Patches) -> Patches:
-    """Weight each patch by a factor of 1 to 1.5, which a network computes from its norm."""
+    """Weight each patch by a factor of 1 to 1.5, which a network computes from its L2 norm."""
     length = jnp.linalg.norm(at_least_float32(patches), axis=-1, keepdims=True) + 1e-6
     weights = 1 + 0.5 * jax.nn.sigmoid(two_layer(params, length, 0.0, None))
     return (at_least_float32(patches) * weights).astype(patches.dtype)
 
 
 def pooled(params: Sage, patches: Patches) -> Float[Array, "*batch feature cluster"]:
-    """Compute each cluster's weighted mean of features, divided by the number of patches."""
+    """Compute each cluster's weighted mean of centred features, divided by the patch count."""
     features = at_least_float32(two_layer(params.cluster_features, patches, 0.0, None))
     scores = at_least_float32(two_layer(params.score, patches, 0.0, None))
     features = features - features.mean(axis=(-2, -1), keepdims=True)

@@ -36,24 +36,24 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 class Salad:
     """The three networks over features, and the transport's learnt parameters.
 
-    The published constant dustbin score has no effect: the transport's potentials absorb it, as
-    well as the bias of the score network's last layer. Both have gradient 0, but public checkpoints
-    contain them.
+    The published constant dustbin score has no effect: the transport's potentials absorb it, and
+    also the bias of the score network's last layer. Score and bias have gradient 0, but are here
+    because public checkpoints contain them.
     """
 
     token_features: TwoLayer
     cluster_features: TwoLayer
     score: TwoLayer
     dust_bin: Any
-    """Learnt parameters of the dustbin, by default its score."""
+    """Learnt parameters of the dustbin: for the default dustbin, its score."""
     log_epsilon: Float[Array, ""] | None = None
-    """Logarithm of the entropic regularisation, if it is learnt."""
+    """Logarithm of the entropic regularisation; None if it is not learnt."""
     step: Any = None
-    """Learnt parameters of the transport's step."""
+    """Learnt parameters of the solver's step; None if it has none."""
     start: Any = None
-    """Learnt parameters of the transport's start."""
+    """Learnt parameters of the solver's start; None if it has none."""
     logit_tau: dict[str, Float[Array, ""]] | None = None
-    """Logits of `row_tau` and `column_tau`, if they are learnt."""
+    """Logits of `row_tau` and `column_tau`, by name; None if they are not learnt."""
 
 
 _TINY = {"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dropout": 0.0}
@@ -84,15 +84,15 @@ class SaladConfig(Aggregator):
     learn_epsilon: bool = False
     """Whether epsilon is learnt, with `epsilon` as initial value."""
     row_tau: float = 1.0
-    """Relaxation of the patches' masses: 1 fixes them; below 1 a Kullback-Leibler penalty of weight
-    epsilon * tau / (1 - tau) pulls them to their marginals. If both sides are relaxed, high scores
-    make masses overflow outside the log domain."""
+    """How closely patches keep to their mass: exactly if 1; if below 1, a Kullback-Leibler penalty
+    of weight epsilon * tau / (1 - tau) pulls them to it. If `column_tau` is below 1 too, high
+    scores can make masses overflow."""
     column_tau: float = 1.0
-    """Like `row_tau`, for the masses of the clusters and the dustbin."""
+    """The same as `row_tau`, for the masses of the clusters and the dustbin."""
     learn_tau: bool = False
-    """Whether `row_tau` and `column_tau`, if below 1, are learnt through a sigmoid."""
+    """Whether `row_tau` and `column_tau`, where below 1, are learnt, through a sigmoid."""
     sinkhorn: SinkhornConfig = SinkhornConfig()
-    """Solver of the transport."""
+    """Solver of the transport problem."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -105,11 +105,11 @@ class SaladConfig(Aggregator):
 
     @property
     def scores(self) -> int:
-        """Number of scores of a patch: one for each cluster, and the dustbin's."""
+        """Number of network scores of a patch: one for each cluster, and any for the dustbin."""
         return self.clusters + self.dustbin.scores
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
-        """Require more patches than clusters if the dustbin's mass is the difference."""
+        """Raise InputError if the dustbin needs more patches than clusters, and there are not."""
         patches = math.prod(grid)
         height, width = (patch_size * side for side in grid)
         side = patch_size * (math.isqrt(self.clusters) + 1)
@@ -125,7 +125,7 @@ class SaladConfig(Aggregator):
         return TokenShape(self.token_dim, self.clusters, self.cluster_dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Salad:
-        """Draw parameters as the public code does: linears as in torch, a dustbin score of 1."""
+        """Draw parameters as the public code does: `nn.Linear` layers, and a dustbin score of 1."""
         token_key, cluster_key, score_key = random_init.split(key, 3)
         dim, hidden = backbone.dim, self.hidden
         below = {name: tau for name, tau in self._taus.items() if tau < 1}
@@ -147,14 +147,14 @@ class SaladConfig(Aggregator):
         return {"row_tau": self.row_tau, "column_tau": self.column_tau}
 
     def dustbin_params(self, params: Any, features: Features) -> Any:
-        """Return the dustbin's parameters, by default those that are learnt."""
+        """Return the dustbin's parameters for an image; by default the learnt ones."""
         return params.dust_bin
 
     def transport(self, params: Any, features: Features, *, key: Keys) -> SinkhornResult:
-        """Assign patches to clusters, dustbin last (SALAD's Eqs. 3 to 5), in float32.
+        """Assign patches to clusters and, last, the dustbin (SALAD's Eqs. 3 to 5), in float32.
 
         Raises:
-            InputError: there are not more patches than clusters.
+            InputError: the dustbin needs more patches than clusters, and there are not.
         """
         patches, learnt = features.patches, params.log_epsilon
         scores = at_least_float32(two_layer(params.score, patches, self.dropout, key))
@@ -174,10 +174,10 @@ class SaladConfig(Aggregator):
         """Return the global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
 
         The tokens include the transport's statistics, without gradients. A batch is faster than
-        `vmap`: the transport chooses its domain once for all images.
+        `vmap`: for it, the transport chooses its domain once for all images.
 
         Raises:
-            InputError: there are not more patches than clusters.
+            InputError: the dustbin needs more patches than clusters, and there are not.
         """
         cluster_key, score_key = split_key(key, 2)
         global_token = two_layer(params.token_features, features.class_token, 0.0, None)
@@ -202,13 +202,13 @@ class Fol(Salad):
     """SALAD's parameters, and two transposed convolutions of 3 x 3 for local features."""
 
     upconv1: Conv = dataclasses.field(kw_only=True)
-    """Makes local features for re-ranking, with `upconv2`; unused by descriptors."""
+    """First of the convolutions that compute local features, only for re-ranking."""
     upconv2: Conv = dataclasses.field(kw_only=True)
 
 
 @AGGREGATORS.register("fol", tiny={**_TINY, "local_hidden": 32, "local": 16})
 class FolConfig(SaladConfig):
-    """FoL's global descriptor: SALAD's with a dustbin from attention (Wang et al., AAAI 2025).
+    """FoL's global descriptor: SALAD with dustbin scores from attention (Wang et al., AAAI 2025).
 
     Written from the paper, with the constants of the public model.
 
@@ -226,7 +226,7 @@ class FolConfig(SaladConfig):
 
     @property
     def scores(self) -> int:
-        """Number of scores of a patch: one per cluster. The dustbin's is not from a network."""
+        """Number of network scores of a patch: one per cluster. The dustbin's is from attention."""
         return self.clusters
 
     def features(self, depth: int) -> FeatureSpec:

@@ -26,7 +26,7 @@ SCALE = 2
 
 @pytree_dataclass
 class SelaVpr:
-    """The exponent of the mean, and two transposed convolutions of 3 x 3."""
+    """The exponent of the generalised mean, and two transposed convolutions of 3 x 3."""
 
     p: Float[Array, ""]
     upconv1: Conv
@@ -66,7 +66,7 @@ class SelaVprConfig(Aggregator):
         )
 
     def apply(self, params: SelaVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the mean of all patches and, in training, the local features for the loss."""
+        """Return the generalised mean of patches; in training, also local features for the loss."""
         tokens = Tokens.of_global(gem(features.patches, params.p))
         if key is None:
             return tokens
@@ -77,10 +77,10 @@ class SelaVprConfig(Aggregator):
 def local_features(
     params: SelaVpr | Fol, patches: Patches, grid: Grid
 ) -> Float[Array, "*batch rows columns local"]:
-    """Upsample the patch grid twice, with a ReLU between, to unit features in at least float32.
+    """Upsample the patches to a finer grid of unit-length local features, at least float32.
 
     Args:
-        params: parameters of the aggregator.
+        params: parameters of the aggregator: two transposed convolutions, with a ReLU between.
         patches: output of the backbone's last layer norm.
         grid: rows and columns of patches; n of them become 4 n - 3.
     """
@@ -93,8 +93,8 @@ def local_features(
 def upconv(params: Conv, x: Map) -> Map:
     """Apply a transposed convolution, as torch's `nn.ConvTranspose2d(3, stride=2, padding=1)`.
 
-    It is a convolution of `x`, with zeros between its pixels, by the flipped kernel. The axes of
-    the weight are row, column, input channel, output channel.
+    It is computed as a convolution with the flipped kernel, after zeros are put between the pixels
+    of `x`. The axes of the weight are row, column, input channel, output channel.
     """
     assert params.bias is not None
     y = jax.lax.conv_general_dilated(

@@ -18,7 +18,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class SelaVprPp:
-    """The linear layers before and after the mean, and its exponent."""
+    """Parameters of a head: the linear layers before and after the mean, and its exponent `p`."""
 
     p: Float[Array, ""]
     before: Linear
@@ -36,10 +36,10 @@ class SelaVprPpConfig(Aggregator):
     """
 
     dim: PositiveInt = 2048
-    """Width of the real-valued descriptor: 4,096 for ViT-L."""
+    """Width of the real-valued descriptor; the public model on ViT-L has 4,096."""
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of a global token."""
+        """Return the shape of a global token of width `self.dim`, without local tokens."""
         return TokenShape(self.dim, 0, self.dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SelaVprPp:
@@ -47,23 +47,23 @@ class SelaVprPpConfig(Aggregator):
         return init_head(key, backbone.dim, self.dim)
 
     def apply(self, params: SelaVprPp, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the output of the head, which is scaled to unit length later."""
+        """Return the output of the head as the global token, not yet scaled to unit length."""
         return Tokens.of_global(head(params, features.patches))
 
 
 @pytree_dataclass
 class SelaVprPpHash:
-    """The heads of both side paths."""
+    """Parameters of the heads on the adapter's two side paths."""
 
     real: SelaVprPp
-    """Head of the first path: real values, which re-rank the first retrievals."""
+    """Head of the first path: real-valued descriptors, which re-rank the first results."""
     hash: SelaVprPp
-    """Head of the second path: the model's descriptor, for search by its bits."""
+    """Head of the second path: the model's descriptor, whose signs are the bits for search."""
 
 
 @AGGREGATORS.register("selavprpp-hash", tiny={"dim": 256, "bits": 128})
 class SelaVprPpHashConfig(SelaVprPpConfig):
-    """SelaVPR++ with its second path: a short descriptor for search by its bits, and re-ranking.
+    """SelaVPR++ with both side paths: a short descriptor to search by bits, a long one to re-rank.
 
     Example:
         >>> from crisalad_jax import ModelConfig, ViTConfig, make_part
@@ -75,14 +75,14 @@ class SelaVprPpHashConfig(SelaVprPpConfig):
     """
 
     bits: PositiveInt = 512
-    """Width of the descriptor, and number of its bits."""
+    """Width of the descriptor, whose signs are its bits."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches of the second side path."""
+        """Request the patches of the adapter's second side path."""
         return FeatureSpec(path=1)
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of a global token."""
+        """Return the shape of a global token of width `bits`, without local tokens."""
         return TokenShape(self.bits, 0, self.bits)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SelaVprPpHash:
@@ -93,7 +93,7 @@ class SelaVprPpHashConfig(SelaVprPpConfig):
         )
 
     def apply(self, params: SelaVprPpHash, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the output of the second path's head, which is scaled to unit length later."""
+        """Return the output of the second path's head as the global token, not yet normalised."""
         return Tokens.of_global(head(params.hash, features.patches))
 
 
@@ -105,7 +105,7 @@ def init_head(key: PRNGKeyArray, dim: int, width: int) -> SelaVprPp:
 
 
 def head(params: SelaVprPp, patches: Patches) -> Float[Array, "*batch width"]:
-    """Apply a linear layer, the generalised mean over its outputs at unit length, and another.
+    """Apply a linear layer, the generalised mean of its unit-length outputs, and a linear layer.
 
     The result is at least float32, and not normalised.
     """

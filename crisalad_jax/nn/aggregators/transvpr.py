@@ -1,6 +1,6 @@
-"""TransVPR's multi-level attention (Wang et al., CVPR 2022, section 3.2), on any of our backbones.
+"""TransVPR's multi-level attention (Wang et al., CVPR 2022, section 3.2), for any backbone.
 
-Features hold the concatenated patches of all levels (`FeatureSpec.levels`).
+A level is the output of a block; each patch has its levels side by side (`FeatureSpec.levels`).
 """
 
 import jax
@@ -16,12 +16,12 @@ from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 KEY_THRESHOLD = 0.02
-"""Fused attention, from 0 to 1, above which the public code selects key patches."""
+"""Fused attention in `key_features`, 0 to 1, above which the public code selects key patches."""
 
 
 @pytree_dataclass
 class TransVpr:
-    """The layer that scores patches for every level, and the linear layer of the descriptor."""
+    """The layer that scores patches for every level, and the descriptor's linear layer."""
 
     attention: Linear
     """Score layer without bias, which a softmax over patches would cancel."""
@@ -38,13 +38,13 @@ class TransVprConfig(Aggregator):
     """Width of the descriptor."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request the patches of several, evenly spaced blocks."""
+        """Request the patches of `levels` evenly spaced blocks, the last one included."""
         require_range(self, 1, depth, "levels")
         numbers = range(1, self.levels + 1)
         return FeatureSpec(tuple(depth * number // self.levels for number in numbers))
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of a global token."""
+        """Return the shape of a global token of width `self.dim`, without local tokens."""
         return TokenShape(self.dim, 0, self.dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> TransVpr:
@@ -56,7 +56,7 @@ class TransVprConfig(Aggregator):
         )
 
     def apply(self, params: TransVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the global descriptor, without local tokens."""
+        """Return a global token of unit length, without local tokens."""
         patches = at_least_float32(features.patches)
         weights = attentions(params, features.patches)
         by_level = patches.reshape(*patches.shape[:-1], self.levels, -1)
@@ -66,18 +66,18 @@ class TransVprConfig(Aggregator):
 
 
 def attentions(params: TransVpr, patches: Patches) -> Float[Array, "*batch patch level"]:
-    """Compute a softmax over patches for every level, from all levels, in at least float32."""
+    """Compute each level's softmax over patches, from scores of all levels, at least float32."""
     return jax.nn.softmax(at_least_float32(linear(params.attention, patches)), axis=-2)
 
 
 def key_features(
     params: TransVpr, patches: Float[Array, "*batch patch wide"], levels: int
 ) -> Patches:
-    """Return the patch tokens of the middle level, and 0 for patches that are not key patches.
+    """Return the middle level of key patches; other patches are 0.
 
-    The attention of every level is rescaled to the range 0 to 1, and so is their sum. Key patches
-    are those above `KEY_THRESHOLD`. As in the public code, tokens are not unit vectors, and no
-    extra layer is learnt for them.
+    The attention of every level is rescaled to the range 0 to 1, summed over levels and rescaled
+    again. Key patches are those above `KEY_THRESHOLD`. As in the public code, the results are not
+    normalised, and no extra layer is learnt for them.
     """
     fused = _stretch(_stretch(attentions(params, patches)).sum(axis=-1, keepdims=True))
     middle = jnp.split(at_least_float32(patches), levels, axis=-1)[levels // 2]

@@ -1,6 +1,6 @@
 """Sums of patches, or of their residuals, by cluster: NetVLAD, SuperVLAD, VLAD-BuFF and AnyLoc.
 
-All of them compute in at least float32, at the highest precision.
+All of them compute in at least float32, at JAX's highest precision of matrix products.
 """
 
 import abc
@@ -41,7 +41,7 @@ BURST = (8.0, 7.0, 1.0)
 
 @dataclasses.dataclass(frozen=True)
 class VladConfig(Aggregator):
-    """Base class of these aggregators: one local token per cluster, as wide as the backbone."""
+    """Base class of VLAD aggregators: one local token per cluster, as wide as the backbone."""
 
     clusters: PositiveInt = 64
 
@@ -50,19 +50,19 @@ class VladConfig(Aggregator):
         require_field(self, "clusters", self.count_centroids(0) > 1, "at least 2 to choose from")
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of one sum for each cluster."""
+        """Return the shape of a local token of width `dim` per cluster, without a global token."""
         return TokenShape(0, self.clusters, dim)
 
     @abc.abstractmethod
     def sums(self, params: Any, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Return a sum of unit patches for each cluster, in at least float32.
+        """Return a sum over an image's unit patches for each cluster, in at least float32.
 
         All products use the highest precision: a small difference in scores or distances can move a
         patch to another cluster.
         """
 
     def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the sum of each cluster, without a global token."""
+        """Scale patches to unit length, and return each cluster's sum as a local token."""
         patches = l2_normalise(at_least_float32(features.patches))
         return Tokens.of_local(self.sums(params, patches))
 
@@ -85,7 +85,7 @@ class NetVladConfig(VladConfig):
     """NetVLAD (Arandjelovic et al., CVPR 2016)."""
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> NetVlad:
-        """Draw unit vectors as centroids. `training.vocabulary` computes them from images."""
+        """Draw unit centroids and a score layer at random; `from_centroids` replaces them."""
         conv_key, centroid_key = random_init.split(key)
         dim = backbone.dim
         return NetVlad(
@@ -94,20 +94,20 @@ class NetVladConfig(VladConfig):
         )
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> NetVlad:
-        """Make parameters as the authors do; see `scores_from_centroids`."""
+        """Make parameters as the authors do from k-means centroids; see `scores_from_centroids`."""
         return NetVlad(scores_from_centroids(centroids, features), centroids)
 
     def sums(self, params: NetVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Sum residuals as in Eq. 4, then intra-normalise (Arandjelovic, Zisserman 2013)."""
+        """Sum residuals (Eq. 4), and normalise each sum (Arandjelovic and Zisserman 2013)."""
         return l2_normalise(residual_sums(shares(params.conv, patches), patches, params.centroids))
 
 
 @pytree_dataclass
 class SuperVlad:
-    """The soft assignment of patches."""
+    """Parameters of the soft assignment of patches."""
 
     conv: Linear
-    """Linear layer without bias from a patch to a score for each cluster, ghosts last."""
+    """Linear layer without bias from a patch to a score for each cluster, ghost clusters last."""
 
 
 @AGGREGATORS.register("supervlad")
@@ -124,7 +124,7 @@ class SuperVladConfig(VladConfig):
     centroid_images: ClassVar[int] = 5000
     clusters: PositiveInt = 4
     ghosts: NonNegativeInt = 1
-    """Number of clusters that take part in the softmax and are dropped after it."""
+    """Number of ghost clusters, which take part in the softmax and are dropped after it."""
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SuperVlad:
         """Draw the score layer as torch draws convolutions."""
@@ -139,7 +139,7 @@ class SuperVladConfig(VladConfig):
         return self.clusters + self.ghosts
 
     def sums(self, params: SuperVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Sum patches weighted by their shares, then normalise each sum, then all together."""
+        """Sum patches weighted by share; normalise each cluster's sum, then all sums together."""
         parts = shares(params.conv, patches)[..., : self.clusters]
         sums = l2_normalise(jnp.einsum("...pk,...pd->...kd", parts, patches, precision="highest"))
         return l2_normalise(sums.reshape(*sums.shape[:-2], -1)).reshape(sums.shape)
@@ -155,14 +155,14 @@ class Reduction:
 
 @pytree_dataclass
 class VladBuff:
-    """The reduction, NetVLAD's parameters after it, and those of the burst weights."""
+    """Parameters: the reduction, NetVLAD's for reduced patches, and those of burst weights."""
 
     reduction: Reduction | None
     conv: Linear
     """Linear layer without bias from a patch to one score for each cluster."""
     centroids: Float[Array, "cluster reduced"]
     burst: Float[Array, "3"]
-    """Slope, offset and power."""
+    """Slope, offset and power of the burst weights; see `burst_weights`."""
 
 
 @AGGREGATORS.register("vlad-buff", tiny={"clusters": 16, "reduced": 32})
@@ -179,7 +179,7 @@ class VladBuffConfig(VladConfig):
     """Width of a patch after the reduction; 0 disables the reduction."""
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of one sum of residuals for each cluster."""
+        """Return the shape of a local token per cluster, `reduced` wide, or `dim` if that is 0."""
         return TokenShape(0, self.clusters, self.reduced or dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> VladBuff:
@@ -199,7 +199,7 @@ class VladBuffConfig(VladConfig):
         """Reduce the features to their principal components, without normalising them again.
 
         Raises:
-            InputError: there are fewer features than components.
+            InputError: there are fewer features, or fewer dimensions, than components.
         """
         if not self.reduced:
             return features
@@ -214,7 +214,7 @@ class VladBuffConfig(VladConfig):
         return VladBuff(reduction, conv, centroids, jnp.asarray(BURST))
 
     def sums(self, params: VladBuff, patches: Patches) -> Float[Array, "*batch cluster reduced"]:
-        """Reduce patches, and sum their residuals, weighted by share divided by burst weight."""
+        """Sum reduced residuals weighted by share / burst weight; normalise each cluster's sum."""
         if params.reduction is not None:
             patches = l2_normalise(reduce_features(params.reduction, patches))
         weighed = shares(params.conv, patches) / burst_weights(params.burst, patches)[..., None]
@@ -230,7 +230,7 @@ class Words:
 
 
 class WordsConfig(VladConfig):
-    """Base class of sums by the nearest visual word, whose words come only from k-means."""
+    """Base class of VLAD by nearest visual word, whose words come only from k-means."""
 
     trainable: ClassVar[bool] = False
 
@@ -245,18 +245,18 @@ class WordsConfig(VladConfig):
 
 @AGGREGATORS.register("anyloc", tiny={"clusters": 16, "layer": -1})
 class AnyLocConfig(WordsConfig):
-    """AnyLoc: hard VLAD on a facet of one layer, without training (Keetha et al., RA-L 2023)."""
+    """AnyLoc: hard VLAD on a facet of one block, without training (Keetha et al., RA-L 2023)."""
 
     clusters: PositiveInt = 32
     """Number of words of the vocabulary, which `crisalad vocabulary` builds."""
     layer: int = -9
-    """Block of the facet, from 0, or from the end if negative: -9 is block 31 of ViT-g's 40,
-    AnyLoc's choice."""
+    """Index of the block that the facet is taken from: from 0, or from the end if negative. -9 is
+    block 31 of ViT-g's 40, AnyLoc's choice."""
     facet: Literal["query", "key", "value", "token"] = "value"
     """Facet of the block: queries, keys or values of its attention, or its output tokens."""
     assignment: Literal["cosine", "euclidean"] = "cosine"
-    """How the nearest word of a patch is found. The public code uses the angle; so does the k-means
-    that builds a vocabulary."""
+    """How the nearest word of a patch is found, also by the k-means that builds a vocabulary. The
+    public code uses "cosine", the angle."""
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the facet, without the last layer norm.
@@ -269,7 +269,7 @@ class AnyLocConfig(WordsConfig):
 
     @property
     def spherical_centroids(self) -> bool:
-        """Whether k-means compares features with centroids by the angle."""
+        """Whether k-means compares features with centroids by the angle; set by `assignment`."""
         return self.assignment == "cosine"
 
     def sums(self, params: Words, patches: Patches) -> Float[Array, "*batch cluster dim"]:
@@ -284,7 +284,7 @@ class AnyLocConfig(WordsConfig):
 
 
 def scores_from_centroids(centroids: Centroids, features: FeatureRows) -> Linear:
-    """Make the score layer as the authors do: alpha times cosines to the k-means centroids.
+    """Make NetVLAD's score layer as its authors do: alpha times cosines to k-means centroids.
 
     alpha is chosen so that a feature's largest share is `RATIO` times its second largest, in the
     geometric mean over these features.
@@ -310,7 +310,7 @@ def scores_from_centroids(centroids: Centroids, features: FeatureRows) -> Linear
 
 
 def shares(conv: Linear, patches: Patches) -> Float[Array, "*batch patch cluster"]:
-    """Assign unit patches softly: compute a softmax over the clusters (the paper's Eq. 3)."""
+    """Return each unit patch's shares of the clusters: a softmax of scores (NetVLAD's Eq. 3)."""
     scores = jnp.matmul(patches, conv.weight, precision="highest")
     return jax.nn.softmax(scores, axis=-1)
 
@@ -318,7 +318,7 @@ def shares(conv: Linear, patches: Patches) -> Float[Array, "*batch patch cluster
 def residual_sums(
     shares: Float[Array, "*batch patch cluster"], patches: Patches, centroids: Centroids
 ) -> Float[Array, "*batch cluster dim"]:
-    """Sum the residuals of all patches from each cluster, weighted by their shares.
+    """Sum the residuals of all patches from each centroid, weighted by the patches' shares.
 
     This is the weighted sum of the patches minus the centroid times the sum of the shares.
     """
@@ -356,11 +356,11 @@ def reduce_features(
 
 
 def burst_weights(burst: Float[Array, "3"], patches: Patches) -> Float[Array, "*batch patch"]:
-    """Count the patches similar to each, softly: sum sigmoids of squared distances.
+    """Compute each patch's burst weight: a soft count of the patches similar to it.
 
     Args:
         burst: slope a, offset b and power p of (sum over j of sigmoid(b - a |x_i - x_j|^2))^p.
-        patches: unit vectors.
+        patches: unit vectors x.
     """
     slope, offset, power = burst
     cosines = jnp.einsum("...id,...jd->...ij", patches, patches, precision="highest")
@@ -371,7 +371,7 @@ def burst_weights(burst: Float[Array, "3"], patches: Patches) -> Float[Array, "*
 def nearest_words(
     words: Centroids, patches: Patches, assignment: Literal["cosine", "euclidean"]
 ) -> Int[Array, "*batch patch"]:
-    """Find the word nearest to every unit patch, by angle or distance."""
+    """Return the index of the word nearest to each unit patch, by angle or Euclidean distance."""
     if assignment == "cosine":
         return jnp.argmax(jnp.matmul(patches, l2_normalise(words).T, precision="highest"), axis=-1)
     products = jnp.matmul(patches, words.T, precision="highest")

@@ -1,6 +1,6 @@
 """VLAD and bags of words, with visual words learnt only by k-means.
 
-Patches of zeros are ignored: an image may have fewer features than there is room for.
+Patches of zeros are ignored: they pad images with fewer features than the backbone's `count`.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class HardVladConfig(WordsConfig):
     def sums(self, params: Words, patches: Patches) -> Float[Array, "*batch cluster dim"]:
         """Sum residuals from the nearest word, and normalise the sum of each cluster.
 
-        Without features, all dimensions are equal.
+        If an image has no features, all values are 1.
         """
         shares = word_shares(params.words, patches)
         sums = l2_normalise(residual_sums(shares, patches, params.words))
@@ -48,7 +48,7 @@ class Bow:
     words: Centroids
     """k-means centroids of unit features; for binary features, the majority of each bit."""
     weights: Float[Array, " cluster"]
-    """log(N / n) of a word that n of the N vocabulary images contain."""
+    """log(N / n) of a word that n of the N images of the vocabulary contain."""
 
 
 @AGGREGATORS.register("bow", tiny={"clusters": 100})
@@ -77,15 +77,15 @@ class BowConfig(Aggregator):
         return Bow(centroids, jnp.ones(len(centroids)))
 
     def with_frequencies(self, params: Bow, images: Sequence[np.ndarray]) -> Bow:
-        """Return the words, weighted by log(N / n) over these images."""
+        """Weight each word by log(N / n), where n of the N images contain it."""
         has = [word_shares(params.words, jnp.asarray(each)).any(axis=0) for each in images]
         count = np.maximum(np.sum(has, axis=0), 1)
         return Bow(params.words, jnp.log(jnp.asarray(len(images) / count, jnp.float32)))
 
     def apply(self, params: Bow, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return each word's share of the patches of an image, times the word's weight.
+        """Return a global token: each word's share of an image's patches, times the word's weight.
 
-        Without features, all dimensions are equal.
+        If an image has no features, all values are 1.
         """
         patches = l2_normalise(at_least_float32(features.patches))
         counts = word_shares(params.words, patches).sum(axis=-2)
@@ -94,7 +94,7 @@ class BowConfig(Aggregator):
 
 
 def word_shares(words: Centroids, patches: Patches) -> Float[Array, "*batch patch cluster"]:
-    """Return 1 for the nearest word of each unit patch; patches of zeros get all zeros."""
+    """Return, for each unit patch, 1 at its nearest word, else 0; patches of zeros get only 0."""
     nearest = jax.nn.one_hot(nearest_words(words, patches, "euclidean"), len(words))
     return nearest * patches.any(axis=-1, keepdims=True)
 

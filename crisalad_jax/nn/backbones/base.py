@@ -15,7 +15,7 @@ from crisalad_jax.nn.layers import Grid, Valid
 from crisalad_jax.utils.errors import InputError
 
 Pixels = Float[Array, "image height width 3"]
-"""Normalised images."""
+"""Normalised images, channels last."""
 TokenBatch = Float[Array, "image token dim"]
 """Tokens of a transformer: the class token first, and the patches last."""
 Patches = Float[Array, "*batch patch dim"]
@@ -31,7 +31,7 @@ class Features(NamedTuple):
     patches: Patches
     """One vector for each patch, in row order."""
     inserted: Float[Array, "*batch inserted dim"] | None = None
-    """One vector for each of `FeatureSpec.inserted`; None without any."""
+    """One output vector for each of `FeatureSpec.inserted`; None if there are none."""
     class_attention: Float[Array, "*batch patch"] | None = None
     """Attention of the class token to each patch, summed over the heads of the last block, in at
     least float32; None unless `FeatureSpec.class_attention` requests it."""
@@ -49,13 +49,13 @@ class FeatureSpec:
     """What to take from the block: its output tokens, or the queries, keys or values of its
     attention, with the heads concatenated."""
     norm: bool = True
-    """Whether the last layer norm is applied."""
+    """Whether the backbone's last layer norm is applied to the features."""
     class_token: bool = False
     """Whether the class token is used. Not every backbone has one."""
     class_attention: bool = False
     """Whether the class token's attention in the last block is used."""
     path: int = 0
-    """Index of the adapters' side path whose tokens are the features."""
+    """Index of the adapters' side path whose tokens are the features; 0 if there is only one."""
     insertion: int | None = None
     """Number of blocks after which the aggregator's own tokens are prepended to all others. None
     if it has none."""
@@ -63,7 +63,7 @@ class FeatureSpec:
     """The aggregator's own tokens, the same for every image, from `Aggregator.inserted`."""
 
     def levels_of(self, depth: int) -> tuple[int, ...]:
-        """Return the levels in a backbone of `depth` blocks.
+        """Return the requested levels as block numbers, for a backbone of `depth` blocks.
 
         Raises:
             InputError: levels out of order or above `depth`, or several for a facet of attention.
@@ -82,7 +82,7 @@ class FeatureSpec:
 class Backbone(Part, abc.ABC):
     """A network that turns pixels into features: a frozen dataclass whose fields are its settings.
 
-    A backbone has at least `dim`, `depth` and `patch_size`, and implements both abstract methods.
+    A subclass has at least `dim`, `depth` and `patch_size`, and implements `init` and `apply`.
     """
 
     dim: PositiveInt = 768
@@ -102,7 +102,7 @@ class Backbone(Part, abc.ABC):
     exposes_levels: ClassVar[bool] = True
     """Whether features can be taken after blocks other than the last."""
     local_features: ClassVar[str | None] = None
-    """Features that the host extracts from photographs to replace pixels: "sift" or "orb"."""
+    """Features that the host extracts to replace pixels, "sift" or "orb"; None takes pixels."""
     binary: ClassVar[bool] = False
     """Whether its features, and so their visual words, take only two values."""
     encoded_size: ClassVar[tuple[int, int] | None] = None
@@ -112,10 +112,10 @@ class Backbone(Part, abc.ABC):
     extras: ClassVar[str] = ""
     """Settings for a one-line summary of a model, each after a comma."""
     trains: ClassVar[tuple[str, ...]] = ()
-    """Names, or name patterns, of the parameters that are meant to be trained.
+    """Names, or name patterns, of the parameters that are meant to be trained; by default none.
 
     They are those of adapters, named as in `init`, such as "blocks.*.adapter" or "lora". A run that
-    trains none of them must ask for that (`--trainable head,-adapters`)."""
+    trains none of them must request it (`--trainable head,-adapters`)."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:
@@ -148,7 +148,7 @@ class Backbone(Part, abc.ABC):
 
         Implement it if leaves of `params.blocks` have a leading axis of `depth` blocks. Training
         cuts the stack so that some blocks train and no gradient passes through frozen ones before
-        them. The parts form a tuple; `apply` accepts both forms.
+        them. The parts form a tuple; `apply` accepts a stack or such a tuple.
 
         Raises:
             InputError: the backbone has no blocks to cut.
@@ -163,7 +163,7 @@ class Backbone(Part, abc.ABC):
         return params
 
     def merge_adapters(self, params: Any) -> tuple[Any, Any]:
-        """Return an equivalent (backbone, params) without adapters; see `merge_adapters`.
+        """Return an equivalent (backbone, params) without adapters; see `nn.model.merge_adapters`.
 
         Raises:
             InputError: the backbone has no adapters, or they cannot be merged.
@@ -173,12 +173,12 @@ class Backbone(Part, abc.ABC):
         )
 
     def adapt_checkpoint(self, config: Any, params: Any, fresh: Any) -> tuple[Any, Any]:
-        """Adapt another backbone's configuration and parameters to this one where possible.
+        """Return another backbone's configuration and parameters, adapted to this one if possible.
 
         Args:
             config: another backbone of this class.
             params: parameters of that backbone.
-            fresh: parameters of this backbone, to use where the other's do not fit.
+            fresh: new parameters of this backbone, to use where the other's do not fit.
         """
         return config, params
 

@@ -1,7 +1,7 @@
-"""DINOv3's vision transformer ViT/16 (Siméoni et al. 2025), as in inference, without augmentation.
+"""DINOv3's vision transformer ViT/16 (Siméoni et al. 2025), without augmentation of positions.
 
 Written from the paper and the behaviour of Hugging Face's DINOv3ViTModel, whose outputs it
-reproduces. Differences from DINOv2: patches of 16 x 16, rotary positions, no bias of the keys, and
+reproduces. Differences from DINOv2: patches of 16 x 16, rotary positions, keys without a bias, and
 the epsilon of the layer norms.
 """
 
@@ -18,7 +18,7 @@ from crisalad_jax.nn.backbones.vit import Block, VisionTransformer
 from crisalad_jax.nn.layers import Linear
 
 PERIOD_BASE = 100.0
-"""Limit of the longest period; the shortest is 1, which is half the side of an image."""
+"""Limit of the longest rotary period; the shortest is 1, half the side of an image."""
 
 
 @BACKBONES.register(
@@ -47,7 +47,7 @@ class DinoV3Config(VisionTransformer):
         require_field(self, "heads", fits, f"a divisor of a fourth of dim ({self.dim})")
 
     def rotation(self, grid: Grid) -> Rotation:
-        """Return the rotation angles of the patches; see `rotary_angles`."""
+        """Return the cosines and sines of the patches' angles; see `rotary_angles`."""
         return _rotation(grid, self.dim // self.heads)
 
     def attention_of(self, layer: Block) -> Attention:

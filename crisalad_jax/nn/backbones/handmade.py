@@ -27,13 +27,13 @@ class HandmadeBackbone(Backbone):
 
 
 class WholeImageBackbone(HandmadeBackbone):
-    """A whole-image descriptor for images of one size."""
+    """Base class of whole-image descriptors, for images of one size."""
 
     size: ClassVar[tuple[int, int]]
-    """Height and width in pixels."""
+    """Height and width in pixels that images must have."""
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
-        """Return 1 x 1: the whole image is one patch."""
+        """Return 1 x 1: the image is one patch. Raise InputError if the size is not `size`."""
         found, expected = (f"{height} x {width}" for height, width in (image_size, self.size))
         require(
             found == expected,
@@ -43,7 +43,7 @@ class WholeImageBackbone(HandmadeBackbone):
 
     @abc.abstractmethod
     def descriptors(self, images: Pixels) -> Float[Array, "image dim"]:
-        """Return the descriptors of images of `size`."""
+        """Return a descriptor, not necessarily of unit length, for each image of size `size`."""
 
     def apply(
         self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid

@@ -21,10 +21,10 @@ _GREY = (9798, 19235, 3735)
 class HogConfig(WholeImageBackbone):
     """Histograms of oriented gradients of 128 x 128 pixels (Dalal and Triggs, CVPR 2005).
 
-    Sobel gradients of the grey image vote, by unsigned angle, linearly for the two nearest of 9
-    bins. Cells have 8 x 8 pixels. Blocks of 2 x 2 cells, one cell apart, are divided by their L2
-    norms. Without gradients, all entries are equal. There are no parameters, and the descriptor is
-    the class token. Preprocessing must leave pixels at 0 to 255: mean 0 and deviation 1/255.
+    Sobel gradients of the grey image vote for the two nearest of 9 bins of unsigned angles, with
+    linear weights. Cells have 8 x 8 pixels. Blocks of 2 x 2 cells, one cell apart, are divided by
+    their L2 norms. In a uniform image, all entries are equal. The descriptor, without parameters,
+    is the class token. Preprocessing must leave pixels at 0 to 255: mean 0 and deviation 1/255.
     """
 
     dim: int = _DIM
@@ -32,7 +32,7 @@ class HogConfig(WholeImageBackbone):
     size: ClassVar[tuple[int, int]] = _SIDE, _SIDE
 
     def descriptors(self, images: Pixels) -> Float[Array, "image dim"]:
-        """Return the descriptors of images of `size`."""
+        """Return a descriptor, not of unit length, for each image of height and width `size`."""
         pixels = jnp.round(images.astype(jnp.float32)).astype(jnp.int32)
         grey = (pixels * jnp.array(_GREY, jnp.int32)).sum(axis=-1) + (1 << 14) >> 15
         padded = jnp.pad(grey.astype(jnp.float32), ((0, 0), (1, 1), (1, 1)), mode="reflect")

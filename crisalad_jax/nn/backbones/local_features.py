@@ -1,4 +1,4 @@
-"""SIFT and ORB features in place of a network's patches, for heads that count visual words.
+"""SIFT and ORB features in place of a network's patches, for heads that use visual words.
 
 The host extracts the features from photographs (`data.local_features`); here their bytes become
 vectors. If an image has fewer than `count` features, its last patches are 0.
@@ -26,7 +26,7 @@ class _LocalFeatureBackbone(HandmadeBackbone):
     exposes_levels: ClassVar[bool] = False
     local_features: ClassVar[LocalFeatures]
     count: PositiveInt = 500
-    """Maximum number of features per image, the strongest."""
+    """Maximum number of features per image; of more, the strongest are used."""
 
     @property
     def encoded_size(self) -> tuple[int, int]:
@@ -34,7 +34,7 @@ class _LocalFeatureBackbone(HandmadeBackbone):
         return self.count, FEATURE_BYTES[self.local_features] // 3
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
-        """Return one row of features, whatever the size of the photograph."""
+        """Return 1 x `count`: one row of features, whatever the size of the photograph."""
         return 1, self.count
 
     @abc.abstractmethod
@@ -66,8 +66,8 @@ class _LocalFeatureBackbone(HandmadeBackbone):
 class SiftConfig(_LocalFeatureBackbone):
     """SIFT (Lowe, IJCV 2004) by OpenCV, as RootSIFT (Arandjelovic and Zisserman, CVPR 2012).
 
-    Each descriptor is divided by its sum, and square roots are taken, so that inner products are
-    the Hellinger kernel of histograms. Preprocessing needs bytes, mean 0 and deviation 1/255.
+    Descriptors are divided by their sums, and square roots are taken: inner products are then the
+    Hellinger kernel of histograms. Preprocessing must use "bytes", mean 0 and deviation 1/255.
     """
 
     local_features: ClassVar[LocalFeatures] = "sift"
@@ -76,7 +76,7 @@ class SiftConfig(_LocalFeatureBackbone):
     def vectors(
         self, numbers: Float[Array, "image feature 128"]
     ) -> Float[Array, "image feature 128"]:
-        """Divide each descriptor by its sum, and return the square roots."""
+        """Divide each descriptor by its sum, and return the square roots: unit vectors."""
         return jnp.sqrt(numbers / jnp.maximum(numbers.sum(axis=-1, keepdims=True), 1))
 
 
@@ -85,7 +85,7 @@ class OrbConfig(_LocalFeatureBackbone):
     """ORB (Rublee et al., ICCV 2011) by OpenCV.
 
     Its 256 bits become -1/16 or 1/16, so that the nearest vector is the one with the most bits in
-    common. Preprocessing needs bytes, mean 0 and deviation 1/255.
+    common. Preprocessing must use "bytes", mean 0 and deviation 1/255.
     """
 
     local_features: ClassVar[LocalFeatures] = "orb"

@@ -31,7 +31,7 @@ class Residual:
     """A residual block: convolutions, and a shortcut where the shape changes."""
 
     convs: tuple[ConvNorm, ...]
-    """Two of 3 x 3; or 1 x 1, 3 x 3, and 1 x 1 to four times the width."""
+    """Two 3 x 3 convolutions; or a 1 x 1, a 3 x 3, and a 1 x 1 to four times the width."""
     shortcut: ConvNorm | None
 
 
@@ -67,7 +67,7 @@ class ResNetConfig(StagedBackbone):
 
     @property
     def extras(self) -> str:
-        """The number of layers, and the width if it is not the published one."""
+        """Number of layers, and the width if it is not the published one, for a summary."""
         width = "" if self.width == 64 else f" of width {self.width}"
         return f", ResNet-{self.layers}{width}"
 
@@ -90,7 +90,7 @@ class ResNetConfig(StagedBackbone):
         )
 
     def adapt_checkpoint(self, config: Any, params: Stages, fresh: Any) -> tuple[Any, Stages]:
-        """Take the first stages of a backbone that has more; torchvision's files have four."""
+        """Take the first stages of a backbone with more of them: torchvision's files have four."""
         stages = min(config.stages, self.stages)
         blocks: Any = params.blocks[:stages]
         changed = dataclasses.replace(config, stages=stages)
@@ -124,10 +124,10 @@ class ResNetConfig(StagedBackbone):
 
 
 def residual(params: Residual, x: Map, valid: Valid, *, stride: int) -> tuple[Map, Residual]:
-    """Add the output of the convolutions to the input; the first 3 x 3 one has the stride.
+    """Add the output of the convolutions to the input; the first 3 x 3 convolution has the stride.
 
     Returns:
-        (y, updated): the output, and the block with its layers as `conv_norm` returns them.
+        (y, updated): the output after a ReLU, and the block as `conv_norm` returns its layers.
     """
     y, convs, shortcut = x, [], params.shortcut
     strided = next(i for i, each in enumerate(params.convs) if each.conv.weight.shape[0] == 3)

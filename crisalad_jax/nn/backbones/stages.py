@@ -28,7 +28,7 @@ class Stage:
 
 @pytree_dataclass
 class Stages:
-    """A convolutional backbone: the stem before its stages, if any, and the stages."""
+    """Parameters of a convolutional backbone: the stem, if any, and the stages after it."""
 
     stem: Any
     blocks: tuple[Stage, ...]
@@ -38,7 +38,7 @@ class Stages:
 class StagedBackbone(Backbone):
     """A backbone whose blocks are stages; each position of the last stage is a feature.
 
-    Its width and its number of stages follow from its other settings.
+    Its width `dim` and number of stages `depth` follow from its other settings.
     """
 
     any_size: ClassVar[bool] = True

@@ -45,7 +45,7 @@ _SMALLEST = 1e-5
 
 @pytree_dataclass
 class TetraBlock:
-    """A pre-norm block like ViT's, plus two layer norms in a ternary block and one in the last."""
+    """A pre-norm block like ViT's, with two more layer norms if ternary, and one more if not."""
 
     norm1: LayerNorm
     attn: Attention
@@ -54,20 +54,20 @@ class TetraBlock:
     norm3: LayerNorm
     fc1: Linear
     norm4: LayerNorm | None
-    """Hidden-layer norm; None in the last block."""
+    """Norm of the hidden layer; None in the last block, which is not ternary."""
     fc2: Linear
 
 
 @pytree_dataclass
 class TetraVit:
-    """The backbone. In `blocks`, the ternary ones, every leaf has a leading axis."""
+    """Parameters of the backbone. Leaves of `blocks`, the ternary ones, have a leading axis."""
 
     pos_embed: Float[Array, "token dim"]
     """Positions of the class token, then of the patches in row order."""
     cls_token: Float[Array, " dim"]
     patch_norm: LayerNorm
     patch_embed: Linear
-    """Layer over pixels in (row, column, channel) order."""
+    """Linear layer over a patch's pixels, in (row, column, channel) order."""
     token_norm: LayerNorm
     blocks: TetraBlock
     last: TetraBlock
@@ -77,8 +77,8 @@ class TetraVit:
 class TetraVitConfig(Backbone):
     """TeTRA's ternary vision transformer with patches of 14 x 14 (Grainge et al. 2025).
 
-    All blocks but the last have ternary weights, in training too: the parameters are the floats
-    before rounding. Images have a fixed size of `position_grid` patches per side.
+    All blocks but the last round their weights to ternary ones, in training too; the parameters are
+    the floats before rounding. Images have a fixed size of `position_grid` patches per side.
     """
 
     exposes_levels: ClassVar[bool] = False
@@ -86,7 +86,7 @@ class TetraVitConfig(Backbone):
     hidden: PositiveInt = 3072
     """Width of the feed-forward networks."""
     position_grid: PositiveInt = 23
-    """Rows and columns of patches in an image: 23 are 322 pixels."""
+    """Number of patches along each side of an image: 23 are 322 pixels."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -95,7 +95,7 @@ class TetraVitConfig(Backbone):
         require_field(self, "depth", self.depth > 1, "at least 2: the last is not ternary")
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
-        """Return the rows and columns of patches, as in the position embeddings."""
+        """Return (`position_grid`, `position_grid`); raise InputError for any other image size."""
         side = self.position_grid * self.patch_size
         height, width = image_size
         require(
@@ -154,7 +154,7 @@ class TetraVitConfig(Backbone):
 
 
 def embed(params: TetraVit, images: Pixels, config: TetraVitConfig) -> TokenBatch:
-    """Return the class token and the patches, normalised before and after embedding."""
+    """Return class token and patches, normalised before and after embedding, plus positions."""
     count, side, size = images.shape[0], config.position_grid, config.patch_size
     pixels = images.reshape(count, side, size, side, size, 3).swapaxes(2, 3)
     patches = layer_norm(params.patch_norm, pixels.reshape(count, side**2, 3 * size**2))
@@ -165,7 +165,7 @@ def embed(params: TetraVit, images: Pixels, config: TetraVitConfig) -> TokenBatc
 
 
 def block(params: TetraBlock, x: TokenBatch, heads: int) -> TokenBatch:
-    """Add attention and the feed-forward network, ternary if the hidden layer has a norm."""
+    """Run a block; its linear layers are ternary if its hidden layer has a norm (`norm4`)."""
     layer = linear if params.norm4 is None else ternary_linear
     qkv = split_heads(layer(params.attn.qkv, layer_norm(params.norm1, x)), 3 * heads)
     mixed = dot_product_attention(*jnp.split(qkv, 3, axis=-2)).reshape(x.shape)
@@ -176,10 +176,10 @@ def block(params: TetraBlock, x: TokenBatch, heads: int) -> TokenBatch:
 
 
 def ternary_linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
-    """Map the last axis, in 8-bit steps, by weights of -1, 0 and 1 times their mean magnitude.
+    """Apply a linear layer with its weights rounded to ternary ones, and `x` to 8-bit steps.
 
-    Rounding is half to even. Sums of steps are integers below 2^24, which float32 holds exactly.
-    Gradients pass straight through the rounding.
+    A weight is -1, 0 or 1 times the mean magnitude of all. Rounding is half to even. Sums of steps
+    are integers below 2^24, exact in float32. Gradients pass straight through the rounding.
 
     Args:
         params: the layer, whose weight is rounded here.

@@ -21,9 +21,9 @@ _LEAST = 0.5
 class ThumbnailConfig(WholeImageBackbone):
     """SeqSLAM's images of 32 x 64 grey pixels (Milford and Wyeth, ICRA 2012).
 
-    Each patch of 8 x 8 is normalised by its mean and deviation. If all are uniform, all entries
-    of the descriptor are equal. There are no parameters, and the descriptor is the class token.
-    Preprocessing must leave pixels at 0 to 255: mean 0 and deviation 1/255.
+    Each patch of 8 x 8 is normalised by its mean and standard deviation. If all patches are
+    uniform, all entries of the descriptor are equal. There are no parameters; the descriptor is the
+    class token. Preprocessing must leave pixels at 0 to 255: mean 0 and deviation 1/255.
     """
 
     dim: int = _DIM
@@ -31,7 +31,7 @@ class ThumbnailConfig(WholeImageBackbone):
     size: ClassVar[tuple[int, int]] = _SIZE
 
     def descriptors(self, images: Pixels) -> Float[Array, "image dim"]:
-        """Return the descriptors of images of `size`."""
+        """Return a descriptor, not of unit length, for each image of height and width `size`."""
         grey = (images.astype(jnp.float32) * jnp.array(_GREY, jnp.float32)).sum(axis=-1)
         patches = grey.reshape(-1, _SIZE[0] // _PATCH, _PATCH, _SIZE[1] // _PATCH, _PATCH)
         centred = patches - patches.mean(axis=(2, 4), keepdims=True)

@@ -46,7 +46,7 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 WIDTHS = (64, 128, 256, 512)
-"""Widths of the convolutions; each is followed by max pooling that halves the grid."""
+"""Output channels of the convolutions; max pooling after each halves the grid."""
 
 
 @pytree_dataclass
@@ -62,11 +62,11 @@ class TransVprBlock:
 
 @pytree_dataclass
 class TransVprNet:
-    """The backbone. In `blocks` every leaf has a leading depth axis."""
+    """Parameters of the backbone. In `blocks` every leaf has a leading depth axis."""
 
     convs: tuple[ConvNorm, ...]
     tokenizers: tuple[Conv, ...]
-    """Non-overlapping convolutions that bring every map to the same grid."""
+    """Convolutions without overlap that bring the feature maps of all layers to the same grid."""
     cls_token: Float[Array, " dim"]
     blocks: TransVprBlock
     norm: LayerNorm
@@ -123,7 +123,7 @@ class TransVprNetConfig(Backbone):
     def apply(
         self, params: TransVprNet, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, TransVprNet]:
-        """Return the concatenated patches of the requested levels, and the last one's class token.
+        """Return the requested levels' patches, concatenated, and the last level's class token.
 
         With remat "full" the backward pass recomputes every block from its input.
 
@@ -154,10 +154,10 @@ def _side(number: int) -> int:
 
 
 def embed(params: TransVprNet, images: Pixels, valid: Valid) -> tuple[TokenBatch, TransVprNet]:
-    """Return the class token, and for every patch a vector with a part from each map.
+    """Return the class token, and a vector for every patch with a part from each feature map.
 
     Returns:
-        (tokens, updated): the second has updated statistics if `valid` is given.
+        (tokens, updated): `updated` is `params`, with new running statistics if `valid` is given.
     """
     x, parts, convs = images, [], []
     for number, layer in enumerate(params.convs):

@@ -1,7 +1,7 @@
 """DINOv2's vision transformer ViT/14 (Oquab et al. 2023; registers: Darcet et al. 2024).
 
-Written from the papers and the behaviour of facebookresearch/dinov2, whose golden outputs it
-reproduces. DINOv3 has the same blocks; its other parts are in `dinov3.py`.
+Written from the papers and the behaviour of facebookresearch/dinov2, whose outputs it reproduces.
+DINOv3 has the same blocks; its other parts are in `dinov3.py`.
 """
 
 import dataclasses
@@ -88,7 +88,7 @@ class Mlp:
 
 @pytree_dataclass
 class SwiGlu:
-    """Feed-forward network of ViT-g: w12 computes gate and value together, w3 projects."""
+    """Feed-forward network of ViT-g, SwiGLU: w12 computes gate and value together, w3 projects."""
 
     w12: Linear
     w3: Linear
@@ -105,18 +105,18 @@ class Block:
     mlp: Mlp | SwiGlu
     ls2: Float[Array, "*stack dim"]
     adapter: Any
-    """Parameters of `VisionTransformer.adapter`; None if it has none."""
+    """Parameters of `VisionTransformer.adapter`; None if the block has none."""
 
 
 @pytree_dataclass
 class ViT:
-    """The backbone. In `blocks` every leaf has a leading depth axis.
+    """Parameters of the backbone.
 
-    The axis of adapters is shorter if only the last blocks have one.
-
-    A tuple of such stacks runs in sequence. Training uses it to exclude frozen blocks from the
-    gradient if only the last ones train. Rotary positions have no parameters: `pos_embed_cls` and
-    `pos_embed` are None. Without registers `register_tokens` is None.
+    Leaves of `blocks` have a leading depth axis, which is shorter for adapters if only the last
+    blocks have one. `blocks` may also be a tuple of such stacks, which run in sequence: training
+    makes one to exclude frozen blocks from the gradient if only the last ones train. Rotary
+    positions have no parameters: `pos_embed_cls` and `pos_embed` are None. So is `register_tokens`
+    without registers.
     """
 
     patch_embed: Linear
@@ -136,7 +136,7 @@ class VisionTransformer(Backbone):
     supports_prompt_tokens: ClassVar[bool] = True
     exposes_cls_attention: ClassVar[bool] = True
     norm_epsilon: ClassVar[float] = NORM_EPSILON
-    """Added to the variance in every layer norm."""
+    """Constant added to the variance in every layer norm."""
     token_deviation: ClassVar[float] = 1e-6
     """Standard deviation of the initial class token and registers."""
     heads: PositiveInt = 12
@@ -161,7 +161,7 @@ class VisionTransformer(Backbone):
 
     @property
     def hidden(self) -> int:
-        """Hidden feed-forward width; for SwiGLU, 2/3 of it rounded up to a multiple of 8."""
+        """Feed-forward width: dim * mlp_ratio; for SwiGLU 2/3 of that, up to a multiple of 8."""
         hidden = int(self.dim * self.mlp_ratio)
         return (int(hidden * 2 / 3) + 7) // 8 * 8 if self.ffn == "swiglu" else hidden
 
@@ -204,7 +204,7 @@ class VisionTransformer(Backbone):
         return layer.attn
 
     def init(self, key: PRNGKeyArray) -> ViT:
-        """Draw parameters as published: linear layers with deviation 0.02, biases of 0."""
+        """Draw parameters as published: linear layers of standard deviation 0.02, biases of 0."""
         patch, first, register, position, block = random_init.split(key, 5)
         deviation, normal = self.token_deviation, random_init.normal
         pos_embed_cls, pos_embed = self.init_positions(position)
@@ -262,8 +262,8 @@ class VisionTransformer(Backbone):
     ) -> tuple[Features, ViT]:
         """Compute features of normalised images whose sides are multiples of the patch size.
 
-        Levels are concatenated, to a width of levels times dim. The class token is the last
-        level's. With several levels the stack of blocks is cut at each, which in inference needs
+        Levels are concatenated, to a width of levels times `dim`. The class token is that of the
+        last level. With several levels the stack of blocks is cut at each, which in inference needs
         memory for a second copy of its parameters. Blocks after the last level are not run.
 
         Args:
@@ -275,8 +275,8 @@ class VisionTransformer(Backbone):
                 are run; None uses the stored ones, without updating them.
 
         Returns:
-            (features, updated): the second is `params`; if `valid` is given, it holds the running
-            statistics, and None for all other leaves.
+            (features, updated): `updated` is `params`, or, if `valid` is given and all blocks are
+            run, that tree with the new running statistics, and None for all other leaves.
 
         Raises:
             InputError: during tracing, if levels are out of order or exceed the number of blocks,
@@ -332,7 +332,7 @@ class VisionTransformer(Backbone):
     def attention_maps(
         self, params: ViT, images: Pixels, block: int
     ) -> Float[Array, "image head token token"]:
-        """Compute the attention of a block; see `nn.model.attention_maps`."""
+        """Compute the attention of the block with index `block`; see `nn.model.attention_maps`."""
         stack, grid = _one_stack(params), self.grid((images.shape[1], images.shape[2]))
         _checked_levels(FeatureSpec(class_attention=True), self)  # refuses the same adapters
         tokens, _ = run_blocks([stack], embed(params, images, self), grid, self, count=block)
@@ -350,18 +350,18 @@ class VisionTransformer(Backbone):
 
     @property
     def trains(self) -> tuple[str, ...]:
-        """Return the name pattern of the adapters' parameters."""
+        """Name pattern of the adapters' parameters; empty without adapters."""
         if isinstance(self.adapter, NoAdapter):
             return ()
         return ("blocks.*.adapter",) if self.adapter.last is None else ("blocks*.adapter",)
 
     def split_blocks(self, params: ViT, cuts: Sequence[int]) -> ViT:
-        """Cut the stack of blocks."""
+        """Cut the stack of blocks before the blocks of these indices, into a tuple of stacks."""
         stack, ends = _one_stack(params), itertools.pairwise((0, *cuts, self.depth))
         return dataclasses.replace(params, blocks=tuple(_cut(stack, *pair) for pair in ends))
 
     def adapt_checkpoint(self, config: Any, params: ViT, fresh: ViT) -> tuple[Any, ViT]:
-        """Take the fresh adapters if the other backbone's differ in kind or size."""
+        """Replace the other backbone's adapters by the fresh ones if kind or settings differ."""
         if config.adapter == self.adapter:
             return config, params
         blocks = dataclasses.replace(_one_stack(params), adapter=_one_stack(fresh).adapter)
@@ -369,7 +369,7 @@ class VisionTransformer(Backbone):
         return changed, dataclasses.replace(params, blocks=blocks)
 
     def merge_adapters(self, params: ViT) -> tuple[Any, ViT]:
-        """Merge the adapters into the linear layers that they update."""
+        """Return (backbone, params) with the adapters merged into the linear layers they update."""
         adapter = self.adapter
         require(
             adapter.has("merge"),
@@ -554,7 +554,7 @@ def _facet(layer: Block, tokens: TokenBatch, config: VisionTransformer, name: st
 def embed(
     params: ViT, images: Float[Array, "*batch height width 3"], config: VisionTransformer
 ) -> Float[Array, "*batch token dim"]:
-    """Embed images: class token, registers and patches, with any positions added."""
+    """Embed images as tokens: class token, registers and patches, with any positions added."""
     *batch, height, width, _ = images.shape
     grid, size = config.grid((height, width)), config.patch_size
     pixels = images.reshape(*batch, grid[0], size, grid[1], size, 3).swapaxes(-4, -3)
@@ -586,7 +586,7 @@ def run_blocks(
 
     Args:
         stacks: blocks whose leaves have a leading depth axis.
-        tokens: of a batch of images.
+        tokens: tokens of a batch of images, from `embed` or an earlier call.
         grid: rows and columns of patches.
         config: configuration of the backbone.
         remat: see `ModelConfig.remat`.
@@ -596,7 +596,7 @@ def run_blocks(
         path: index of the adapters' side path to run.
 
     Returns:
-        (tokens, statistics): the second has a stack of running statistics for each of `stacks`.
+        (tokens, statistics): `statistics` has a stack of running statistics for each of `stacks`.
     """
     front = 0
     if config.adapter.has("prompts"):
@@ -681,13 +681,13 @@ def block(
     """Run one block (paper Eq. 2), with LayerScale on the sum of MLP and adapter, as in CricaVPR.
 
     Args:
-        params: the block.
-        tokens: of a batch of images.
-        info: describes these tokens.
+        params: parameters of one block, without a depth axis.
+        tokens: tokens of a batch of images.
+        info: grid, padding and valid images of these tokens.
         config: configuration of the backbone.
 
     Returns:
-        (tokens, statistics): the second has the running statistics, and None for other leaves.
+        (tokens, statistics): `statistics` is a block of running statistics, with None elsewhere.
     """
     adapter = _adapter_of(params, config)
     normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
@@ -781,9 +781,9 @@ def interpolate_positions(
     """Resize the stored grid of position embeddings as the public models do.
 
     Bicubic interpolation is linear and separable: two small matrix products, whose constants are
-    computed during tracing. One set of weights therefore serves every image size. Models without
+    computed during tracing. One stored grid therefore serves every image size. Models without
     registers use torch's bicubic (a = -0.75) with the scale (size + 0.1) / grid. Models with
-    registers use its antialiased one (a = -0.5) at the exact scale; see also `position_resize`.
+    registers use the antialiased bicubic (a = -0.5) at the exact scale; see `position_resize`.
     """
     antialias = config.registers and config.position_resize == "dinov2"
     return resize_grid(positions, grid, _antialias_weights if antialias else bicubic_weights)
@@ -794,7 +794,7 @@ def resize_grid(
     grid: Grid,
     weights: Callable[[int, int], Float[np.ndarray, "target source"]],
 ) -> Float[Array, "rows columns dim"]:
-    """Resize a square grid with the interpolation weights of each side."""
+    """Resize a square grid by two products with the matrices `weights(side, new_side)`."""
     side = positions.shape[0]
     if grid == (side, side):
         return positions
@@ -812,9 +812,9 @@ def _cubic(x: np.ndarray, a: float) -> np.ndarray:
 
 @functools.cache
 def bicubic_weights(source: int, target: int, more: float = 0.1) -> np.ndarray:
-    """Compute (target, source) weights of torch's bicubic upsampling, with replicated borders.
+    """Compute the (target, source) matrix of torch's bicubic upsampling, with replicated borders.
 
-    The scale is that of a target longer by `more`, as in DINOv2.
+    The scale is that of a target longer by `more` pixels, as in DINOv2.
     """
     scale = source / (target + more)
     centres = (np.arange(target) + 0.5) * scale - 0.5

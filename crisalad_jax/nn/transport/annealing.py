@@ -13,11 +13,11 @@ from crisalad_jax.nn.transport.steps import STEPS, Moved, Step, check_balanced, 
 
 @STEPS.register("annealing")
 class AnnealingStep(Step):
-    """Take Sinkhorn's step at `start` times epsilon first, and at epsilon after `cooling` steps.
+    """Sinkhorn's step at `start` times epsilon first, and at epsilon after `cooling` iterations.
 
-    In between, epsilon falls by the same factor each time. Problems must be balanced. Epsilon
-    depends on the number of the iteration, so a warm start is heated again, and the gradient
-    "optimistix" never cools.
+    In between, epsilon falls by the same factor each time. Problems must be balanced (both taus 1).
+    Epsilon depends on the number of the iteration: it also starts high after a warm start, and
+    never falls with the gradient "optimistix", whose iterations all have number 0.
     """
 
     entropic: ClassVar[bool] = True
@@ -31,7 +31,7 @@ class AnnealingStep(Step):
         require_field(self, "start", 1 <= self.start < math.inf, "at least 1")
 
     def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
-        """Take the two half steps of the smoother problem.
+        """Take both half steps at the larger epsilon of this iteration.
 
         Raises:
             InputError: the problem's marginals are relaxed.
@@ -45,5 +45,5 @@ class AnnealingStep(Step):
         return Potentials(row, column), state
 
     def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
-        """Meet the rows' marginals at epsilon itself, wherever the schedule stopped."""
+        """Meet the rows' marginals at epsilon itself, whatever the last iteration's epsilon was."""
         return potentials._replace(row=problem.log_mu - problem.lse_columns(potentials.column))

@@ -11,11 +11,11 @@ from crisalad_jax.nn.transport.steps import STEPS, Moved, Step
 
 @STEPS.register("capacities")
 class CapacityStep(Step):
-    """Treat the columns' marginals as capacities: lower full columns, leave the others.
+    """Sinkhorn's step with the columns' marginals as capacities, which columns need not fill.
 
-    The plan maximises <P, S> + epsilon * entropy(P) over plans that meet the rows' marginals and
-    exceed no column's (Benamou et al., SIAM J. Sci. Comput. 2015). A column's potential is at most
-    0, and is 0 if the column is not full. The rows' marginals are met last.
+    For scores S, the plan P maximises <P, S> + epsilon * entropy(P) over plans that meet the rows'
+    marginals and exceed no column's (Benamou et al., SIAM J. Sci. Comput. 2015). A column's
+    potential is at most 0, and is 0 if the column is not full. The rows' marginals are met last.
 
     Example:
         >>> from crisalad_jax.sinkhorn import SinkhornConfig, assign_with_dustbin
@@ -27,7 +27,7 @@ class CapacityStep(Step):
 
     capacities: ClassVar[bool] = True
     free_last: bool = True
-    """Whether the last column, the dustbin, takes whatever is left, without a capacity."""
+    """Whether the last column, the dustbin, takes all that is left, without a capacity."""
 
     def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Lower the columns that are above their marginals, then meet the rows'."""

@@ -37,7 +37,7 @@ def check_inputs(
         scores: see `solve`.
         log_mu: see `solve`.
         log_nu: see `solve`.
-        numbers: epsilon and both taus, a value for all problems or one per problem; None is 1.
+        numbers: epsilon, row_tau and column_tau, for all problems or one per problem; None is 1.
         init: see `solve`.
         equal_totals: whether the masses of both sides must have the same total.
 
@@ -97,7 +97,7 @@ def check_inputs(
 
 
 def per_problem(numbers: Array, axes: int) -> Array:
-    """Append axes to an array of one value per problem; one value for all stays as it is."""
+    """Append `axes` axes of size 1 to an array of one value per problem; scalars do not change."""
     return jnp.expand_dims(numbers, tuple(range(-axes, 0))) if numbers.ndim else numbers
 
 
@@ -122,7 +122,7 @@ def _rounding(*log_masses: Array) -> float:
 
 
 def equal_totals(log_mu: Array, log_nu: Array, wide: jnp.dtype) -> tuple[Array, Array]:
-    """Widen marginals; if they were narrower than `wide`, give the columns the rows' total.
+    """Widen marginals to `wide`; if any was narrower, scale the columns' to the rows' total.
 
     Totals that differ by more than rounding explains stay as they are.
     """
@@ -140,7 +140,7 @@ def check_start(config: SinkhornConfig, problem: Problem, params: Any) -> None:
     """Check that a start returns potentials of the problem's shapes.
 
     Raises:
-        InputError: it does not, or its parameters are missing; the message names the start.
+        InputError: shapes differ, or the start needs parameters; the message names the start.
     """
     start, name = config.start, f"start {config.start.part_name}"
     _check_params(name, start, params, "start_params")
@@ -158,7 +158,7 @@ def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
     """Check that a step returns potentials and a state of the shapes that it was given.
 
     Raises:
-        InputError: it does not, or its parameters are missing; the message names the step.
+        InputError: shapes differ, or the step needs parameters; the message names the step.
     """
     step, name = config.step, f"step {config.step.part_name}"
     _check_params(name, step, params, "step_params")

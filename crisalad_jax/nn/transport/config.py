@@ -15,16 +15,16 @@ from crisalad_jax.nn.transport.steps import STEPS, Step
 
 
 class Solution(NamedTuple):
-    """The result of the iterations."""
+    """The potentials after the iterations, and how many there were."""
 
     potentials: Potentials
     iterations: Int[Array, "*batch"]
     met: Bool[Array, "*batch"]
-    """Whether the tolerance was met; False if there is none."""
+    """Whether the tolerance was met; False without a tolerance."""
 
 
 class Gradient(Part):
-    """A gradient of the potentials, through which JAX differentiates the plan."""
+    """A rule for the gradient of the potentials, through which JAX differentiates the plan."""
 
     at_convergence: ClassVar[bool | None] = None
     """True: gradient of the converged plan, which needs a tolerance. False: gradient of a fixed
@@ -38,7 +38,7 @@ class Gradient(Part):
     def solve(
         self, problem: Problem, config: "SinkhornConfig", params: Any, init: Potentials
     ) -> Solution:
-        """Return the solution, with this gradient."""
+        """Solve from `init`, so that JAX differentiates by this rule; `params` are the step's."""
         raise NotImplementedError
 
 
@@ -61,15 +61,15 @@ class SinkhornConfig:
     iterations: PositiveInt = 3
     """Number of iterations; with a tolerance, at most this number."""
     tolerance: PositiveFloat | None = None
-    """Iterations stop when a step's error (`Step.error`) is at most this; for "sinkhorn" it is, to
-    first order, the relative marginal error before the step. float32 may never get below 1e-5."""
+    """Largest `Step.error` at which iterations stop; None runs all. For "sinkhorn" it is, to first
+    order, the relative marginal error before the step. float32 may never get below 1e-5."""
     throw: bool = False
     """Whether to raise if the tolerance is not met; otherwise the result reports it."""
     domain: Literal["scaling", "log"] = "scaling"
-    """Domain of the sums. Scaling computes exponentials once; problems whose scores are too far
-    apart for it are solved again in the log domain."""
+    """Domain of the sums. "scaling" computes exponentials once; problems whose scores are too far
+    apart for it are solved again in the "log" domain."""
     anderson_memory: NonNegativeInt = 0
-    """Number of past iterations for Anderson acceleration; 0 for none."""
+    """Number of past iterations that Anderson acceleration uses, at least 2; 0 disables it."""
     gradient: OrName[Gradient] = part_field(GRADIENTS, "unrolled")
     """Gradient of the potentials: unrolled (through the iterations), implicit (closed form of the
     optimality conditions), optimistix (fixed point and adjoint of that library), or stop

@@ -17,7 +17,7 @@ from crisalad_jax.utils.target import target
 def solve_in_domain(
     problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
 ) -> Solution:
-    """Iterate in the configured domain; scores too far apart for scaling use the log domain."""
+    """Iterate in the configured domain; problems with scores too far apart for it use "log"."""
     # Leaving the scaling domain takes a branch.
     if config.domain == "log" or not target().branches:
         return iterate(problem, config, params, init)
@@ -47,7 +47,7 @@ def solve_in_domain(
 
 @GRADIENTS.register("unrolled")
 class Unrolled(Gradient):
-    """Differentiate through the iterations: the exact gradient of that many iterations."""
+    """The gradient through the iterations, exact for the number of iterations that is run."""
 
     at_convergence: ClassVar[bool | None] = False
 
@@ -60,7 +60,7 @@ class Unrolled(Gradient):
 
 @GRADIENTS.register("stop")
 class Stop(Gradient):
-    """Treat the potentials as constants."""
+    """No gradient: the potentials are constants."""
 
     def solve(
         self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
@@ -72,7 +72,7 @@ class Stop(Gradient):
 
 @GRADIENTS.register("implicit")
 class Implicit(Stop):
-    """Differentiate the optimality conditions in closed form, without storing iterations."""
+    """The gradient of the optimality conditions in closed form, without storing iterations."""
 
     at_convergence: ClassVar[bool | None] = True
     needs_entropic: ClassVar[bool] = True
@@ -80,7 +80,7 @@ class Implicit(Stop):
     def solve(
         self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
     ) -> Solution:
-        """Solve, and attach the derivative of the solution."""
+        """Solve, and attach the derivative of the converged solution."""
         solution = super().solve(problem, config, params, init)
         return solution._replace(potentials=_at_solution(problem, solution.potentials))
 
@@ -125,7 +125,7 @@ def _at_solution_jvp(primals: Any, tangents: Any) -> tuple[Potentials, Potential
 
 @GRADIENTS.register("optimistix")
 class Optimistix(Gradient):
-    """Find the fixed point with a solver of optimistix, and differentiate with its adjoint.
+    """The fixed point found by a solver of optimistix, differentiated by an implicit adjoint.
 
     Every step gets the state of `Step.init` and the iteration number 0. `Step.finish` is not
     called.
@@ -142,7 +142,7 @@ class Optimistix(Gradient):
         init: Potentials,
         solver: Any = None,
     ) -> Solution:
-        """Solve with `solver`, or with optimistix's plain fixed-point iteration."""
+        """Solve with `solver`; None is optimistix's plain fixed-point iteration."""
         import lineax
         import optimistix
 

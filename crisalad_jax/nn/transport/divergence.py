@@ -30,16 +30,16 @@ def sinkhorn_divergence(
     never negative at convergence, and nears the squared Wasserstein distance as epsilon falls.
 
     The gradient is Danskin's: potentials are constants, because they maximise the dual. It is exact
-    at convergence, stores no iterations, and cannot be differentiated again.
+    at convergence and stores no iterations; second derivatives are wrong.
 
     Args:
         x: tokens of one image of each pair.
-        y: tokens of the other, of the same width.
+        y: tokens of the other image, of the same width.
         log_mu: logarithms of the masses of `x`, -inf for a token to leave out; by default all are
             equal. They are normalised to sum to 1.
         log_nu: the same for `y`.
         epsilon: entropic regularisation, in units of the cost.
-        config: the solver, of which only the potentials are used.
+        config: the solver of the three problems, of which only the potentials are used.
 
     Returns:
         The divergence of each pair, in float32 at least.
@@ -103,14 +103,14 @@ def entropic_cost(
 def squared_distances(
     x: Float[Array, "*batch x_token dim"], y: Float[Array, "*batch y_token dim"]
 ) -> Float[Array, "*batch x_token y_token"]:
-    """Return |x_n - y_k|^2 for all pairs of tokens, at least 0."""
+    """Return |x_n - y_k|^2 for all pairs of tokens, clamped to at least 0."""
     squares = [(side**2).sum(axis=-1) for side in (x, y)]
     inner = product("...nd,...kd->...nk", x, y)
     return jnp.maximum(squares[0][..., :, None] + squares[1][..., None, :] - 2 * inner, 0)
 
 
 def log_masses(tokens: Array, given: Array | None = None) -> Array:
-    """Return the logarithms of tokens' masses, which sum to 1; by default all are equal."""
+    """Return logarithms of masses that sum to 1: `given`, normalised, or equal masses."""
     shape = tokens.shape[:-1]
     if given is None:
         return jnp.full(shape, -math.log(shape[-1]))

@@ -1,8 +1,8 @@
 """Dustbins, which take the patches that belong to no cluster, and their marginals.
 
-The mass of a dustbin is set here, in `marginals`: what the clusters leave for "column" and "token"
-(`log_marginals`), all patches for "row and column", a learnt share for "mass". It is separate from
-the score that the dustbin appends.
+`marginals` sets the mass of a dustbin: what the clusters leave for "column" and "token" (see
+`log_marginals`), all patches for "row and column", a learnt share for "mass". The mass is separate
+from the score that the dustbin appends.
 """
 
 import math
@@ -41,7 +41,7 @@ class Dustbin(Part):
     takes_difference: ClassVar[bool] = False
     """Whether its mass is the number of patches minus that of clusters, which must be positive."""
     capacities: ClassVar[bool] = False
-    """Whether its clusters may take less than their masses, which not every step supports."""
+    """Whether its clusters may take less than their marginals, which not every step supports."""
 
     def init(self, key: PRNGKeyArray, dim: int) -> Any:
         """Return the initial parameters, a pytree of arrays; by default None.
@@ -72,7 +72,7 @@ DUSTBINS = Registry("dustbin", Dustbin)
 
 
 def check_params(params: Any, *shape: int) -> Array:
-    """Return a dustbin's parameters, which must be an array of this shape."""
+    """Return a dustbin's parameters as an array; raise InputError if its shape is not `shape`."""
     found = jnp.shape(params) if params is not None else None
     require(found == shape, f"dustbin: found parameters of shape {found}, expected {shape}")
     return jnp.asarray(params)
@@ -83,7 +83,7 @@ class NoDustbin(Dustbin):
     """No dustbin: the clusters share the patches' mass equally."""
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
-        """Return the scores unchanged."""
+        """Return the scores unchanged; each cluster has the same mass."""
         rows, clusters = scores.shape[-2:]
         log_nu = jnp.full(clusters, math.log(rows / clusters), scores.dtype)
         return Marginals(scores, jnp.zeros(rows, scores.dtype), log_nu)
@@ -93,7 +93,7 @@ class ScalarDustbin(Dustbin):
     """Base class of dustbins with one learnt scalar."""
 
     def init(self, key: PRNGKeyArray, dim: int) -> Array:
-        """Start at 1: the score of the public implementation, or a logit whose share is 0.73."""
+        """Return 1: the score of the public implementation, or a logit whose share is 0.73."""
         return jnp.ones(())
 
 
@@ -139,13 +139,13 @@ class TokenDustbin(Dustbin):
 
 @DUSTBINS.register("mass")
 class MassDustbin(ScalarDustbin):
-    """A column with a learnt mass, given by its share's logit; clusters share the rest equally.
+    """A column with a learnt mass, sigmoid(logit) of all mass; clusters share the rest equally.
 
-    The initial share is 0.73; the published one at 224 x 224 is 0.75.
+    The initial share is 0.73; that of published SALAD at 224 x 224 is 0.75.
     """
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
-        """Append a column of zero scores."""
+        """Append a column of zero scores; `params` is the logit of its share."""
         rows, clusters = scores.shape[-2:]
         logit = check_params(params)
         share = jax.nn.log_sigmoid(jnp.stack([-logit, logit])).astype(scores.dtype) + math.log(rows)

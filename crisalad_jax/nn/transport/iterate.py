@@ -29,7 +29,7 @@ _flat = functools.partial(jnp.concatenate, axis=-1)
 
 
 class Memory(NamedTuple):
-    """The results of the last steps, and their residuals (result minus start)."""
+    """The results of the last steps (`images`), and these minus their starts (`moves`)."""
 
     start: Potentials
     """Potentials from which the next step starts."""
@@ -95,7 +95,7 @@ def iterate(
     Args:
         problem: scores and marginals.
         config: the step, the number of iterations, and when to stop.
-        params: learnt parameters of the step.
+        params: learnt parameters of the step; None if it has none.
         init: potentials to start from; None starts from zeros.
 
     Returns:

@@ -23,17 +23,17 @@ class Momentum(NamedTuple):
 class NesterovStep(Step):
     """Sinkhorn's step from extrapolated column potentials, with restarts.
 
-    With the rows met, Sinkhorn's update of the columns is a mirror step of length 1 on the
-    semi-dual, which Nesterov's method accelerates (Soviet Math. Dokl. 1983; Xu and Chen,
-    arXiv:2605.30267, have such a method with a proven rate). Here it is a plain extrapolation by
-    t / (t + 3), where t restarts when the last move was against the gradient (O'Donoghue and
-    Candes, Found. Comput. Math. 2015). No gradient flows through t.
+    If rows meet their marginals, Sinkhorn's update of the columns is a mirror step of length 1 on
+    the semi-dual, which Nesterov's method accelerates (Soviet Math. Dokl. 1983; Xu and Chen,
+    arXiv:2605.30267, have such a method with a proven rate). Here each change of the columns is
+    extended by t / (t + 3). The count of iterations t restarts when the last change was against the
+    gradient (O'Donoghue and Candes, Found. Comput. Math. 2015). No gradient flows through t.
     """
 
     entropic: ClassVar[bool] = True
 
     def init(self, problem: Problem, params: Any) -> Momentum:
-        """Start without a previous move."""
+        """Return a state without a previous change."""
         zeros = problem.zeros().column
         return Momentum(zeros, 0 * zeros[..., 0])
 

@@ -1,10 +1,10 @@
 """Partial transport: only a share of the patches' mass moves, and the dustbin takes the rest.
 
-Entropic partial transport (Benamou et al., SIAM J. Sci. Comput. 2015) maximises <P, S> + epsilon *
-entropy(P) over plans P between patches and clusters that move a given total mass, and never exceed
-the mass of a patch or cluster. In the log domain P is exp(kernel + row + column), where row
-potentials are at most 0, and column potentials at most a level that all clusters share, at which
-the total is met.
+Entropic partial transport (Benamou et al., SIAM J. Sci. Comput. 2015) maximises, given scores S,
+<P, S> + epsilon * entropy(P) over plans P between patches and clusters that move a given total
+mass, and never exceed the mass of a patch or cluster. P is exp(kernel + row + column), where row
+potentials are at most 0, and column potentials at most a level shared by all clusters, at which the
+total is met.
 """
 
 import math
@@ -30,8 +30,8 @@ from crisalad_jax.nn.transport.steps import STEPS, Moved, Step
 class PartialDustbin(Dustbin):
     """The mass that partial transport leaves in the patches; it has no score.
 
-    A share of the patches' mass moves to clusters, each of which takes at most `room` times an
-    equal part of it. Use it with the step "partial".
+    A share of the patches' mass moves to the clusters, each of which takes at most `room` times an
+    equal part of that share. Use it with the step "partial".
 
     Example:
         >>> from crisalad_jax.sinkhorn import PartialDustbin, SinkhornConfig, assign_with_dustbin
@@ -55,7 +55,7 @@ class PartialDustbin(Dustbin):
         require_field(self, "room", 1 <= self.room < math.inf, "at least 1")
 
     def init(self, key: PRNGKeyArray, dim: int) -> Array | None:
-        """Start at the logit of `share`; None if it is not learnt."""
+        """Return the logit of `share`; None if it is not learnt."""
         return jnp.full((), self._logit, jnp.float32) if self.learn else None
 
     @property
@@ -74,7 +74,7 @@ class PartialDustbin(Dustbin):
 
 @STEPS.register("partial")
 class PartialStep(Step):
-    """Move all mass but the last column's marginal, within the marginals of patches and clusters.
+    """Transport of all mass but the last column's marginal, within the marginals of the others.
 
     The last column of the plan is what patches keep; its scores have no effect. Columns and their
     level are solved for together, then the rows. So the moved total is met at convergence, and
@@ -94,7 +94,7 @@ class PartialStep(Step):
         return Potentials(jnp.where(row < 0, row, 0), column), state
 
     def log_plan(self, problem: Problem, potentials: Potentials) -> Matrix:
-        """Append what each patch keeps to what it moves."""
+        """Return logarithms of what each patch moves and, in the last column, of what it keeps."""
         moved = problem.log_plan(potentials)[..., :-1]
         share = jax.nn.logsumexp(moved, axis=-1) - problem.log_mu
         # Rows that give all have a negative potential; what rounding leaves of them is dropped.

@@ -1,4 +1,4 @@
-"""The entropic transport problem, in the log or the scaling domain, and the errors of a plan."""
+"""The entropic transport problem, in the log or scaling domain, and a plan's marginal errors."""
 
 import dataclasses
 import functools
@@ -12,19 +12,18 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 SCALING_RANGE = 60
-"""Largest difference of two scores of a row, over epsilon, that the scaling domain is exact for.
+"""Bound on the difference of two scores of a row, divided by epsilon, in the scaling domain.
 
-Within it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
-exp(-87), does not reach the last place of such a sum."""
+Below it the sums are exact up to rounding: none is less than exp(-60), whatever the potentials, and
+terms below exp(-87), which float32 flushes to zero, are too small to change such a sum."""
 
 LOG_ZERO = -1e5
-"""Logarithm below which a mass is 0: no float format can hold exp(-1e5)."""
+"""Logarithm below which a mass counts as 0: no float format can represent exp(-1e5)."""
 EMPTY = -1e30
-"""Logarithm that stands for a mass of 0, and the potential of such a row or column.
+"""Logarithm used for a mass of 0, and the potential of a row or column with that mass.
 
-It is finite, so that differences and gradients are too, and so low that adding numbers of the size
-of potentials does not change it.
-"""
+It is finite, so that differences and gradients are finite too, and so low that adding the potential
+of another row or column does not change it."""
 
 
 Matrix = Float[Array, "*batch rows columns"]
@@ -34,7 +33,7 @@ Columns = Float[Array, "*batch columns"]
 
 @brief
 class Potentials(NamedTuple):
-    """Dual variables over epsilon: the plan is exp(kernel + row + column)."""
+    """Dual variables divided by epsilon: the plan is exp(scores / epsilon + row + column)."""
 
     row: Rows
     column: Columns
@@ -45,16 +44,17 @@ class Problem:
     """Scores and marginals of entropic transport, with sums taken in the log domain.
 
     The last column is stored separately, because it is usually an appended dustbin. The compiler
-    then need not write out the joined matrix, and the number of other columns stays a power of two.
+    then need not write out the joined matrix, and the number of other columns can be a power of
+    two.
 
     Attributes:
-        clusters: all columns but the last of the scores over epsilon.
-        last: the last column.
-        log_mu: logarithms of the rows' masses; `EMPTY` for a mass of 0.
-        log_nu: the same for the columns' masses.
-        taus: for the rows and for the columns. None if they meet their marginals exactly; else an
-            array of shape (*batch, 1), below 1: a Kullback-Leibler penalty of weight
-            epsilon * tau / (1 - tau) pulls them there (Chizat et al., Math. Comp. 2018).
+        clusters: scores divided by epsilon, without the last column.
+        last: the last column of the scores divided by epsilon.
+        log_mu: logarithms of the rows' masses (required sums); `EMPTY` for a mass of 0.
+        log_nu: logarithms of the columns' masses, those of the last column included.
+        taus: tau of the rows, and tau of the columns. None for sums that meet the marginals
+            exactly; else an array of shape (*batch, 1), below 1: a Kullback-Leibler penalty of
+            weight epsilon * tau / (1 - tau) pulls the sums there (Chizat et al., Math. Comp. 2018).
 
     Example:
         >>> problem = Problem.of(jnp.eye(2), jnp.zeros(2), jnp.zeros(2))
@@ -77,10 +77,11 @@ class Problem:
         row_tau: float | Array = 1.0,
         column_tau: float | Array = 1.0,
     ) -> "Problem":
-        """Make a problem from the scores over epsilon and the logarithms of the masses.
+        """Make a problem from scores divided by epsilon, and the logarithms of the masses.
 
-        The logarithm of a mass of 0 is -inf, or any value below -1e5. An array tau has one value,
-        or the shape (*batch, 1) of `taus`.
+        The logarithm of a mass of 0 is -inf, or any value below -1e5. A tau of 1.0 makes sums meet
+        their marginals exactly. As an array, a tau has one value, or the shape (*batch, 1) of
+        `taus`.
         """
         one = (*kernel.shape[:-2], 1)
 
@@ -98,22 +99,22 @@ class Problem:
 
     @property
     def row_tau(self) -> float | Array:
-        """Factor of the rows' half step: 1.0, or an array of shape (*batch, 1)."""
+        """Factor on updates of the row potentials: 1.0, or an array of shape (*batch, 1)."""
         return 1.0 if self.taus[0] is None else self.taus[0]
 
     @property
     def column_tau(self) -> float | Array:
-        """Factor of the columns' half step; see `row_tau`."""
+        """Factor on updates of the column potentials; see `row_tau`."""
         return 1.0 if self.taus[1] is None else self.taus[1]
 
     @property
     def kernel(self) -> Matrix:
-        """Scores divided by epsilon."""
+        """Scores divided by epsilon, with all columns."""
         return _joined(self.clusters, self.last)
 
     @property
     def balanced(self) -> bool:
-        """Whether both sides meet their marginals exactly at convergence."""
+        """Whether rows and columns both meet their marginals exactly at convergence."""
         return all(tau is None for tau in self.taus)
 
     @property
@@ -122,11 +123,9 @@ class Problem:
         return self.log_mu < LOG_ZERO, self.log_nu < LOG_ZERO
 
     def masked(self, potentials: Potentials, value: float = EMPTY) -> Potentials:
-        """Set the potentials of rows and columns without mass.
+        """Set the potentials of rows and columns without mass to `value`.
 
-        Args:
-            potentials: potentials of all rows and columns.
-            value: value to set; the default `EMPTY` leaves them out of every sum and plan.
+        The default, `EMPTY`, leaves these rows and columns out of every sum and plan.
         """
         pairs = zip(self.empty, potentials, strict=True)
         return Potentials(*(jnp.where(empty, value, x) for empty, x in pairs))
@@ -148,20 +147,20 @@ class Problem:
         return _joined(clusters, self.last + row + column[..., -1:])
 
     def zeros(self) -> Potentials:
-        """Return zero potentials, but `EMPTY` where there is no mass."""
+        """Return potentials of 0, and of `EMPTY` for rows and columns without mass."""
         return self.masked(zero_potentials(self.kernel))
 
 
 @pytree_dataclass
 class ScalingProblem(Problem):
-    """A problem with sums in the scaling domain: exponentials once, then matrix products.
+    """A problem with sums taken in the scaling domain: exponentials once, then matrix products.
 
     Attributes:
-        row_max: each row's largest score.
+        row_max: each row's largest score, divided by epsilon.
         gibbs: exp(clusters - row_max).
         gibbs_last: exp(last - row_max).
-        in_range: whether the scores are close enough for the sums to be exact. If not, all sums are
-            finite but wrong.
+        in_range: whether the scores of every row, in the whole batch, are close enough for exact
+            sums (`SCALING_RANGE`). If not, all sums are finite but wrong.
     """
 
     row_max: Rows = dataclasses.field(kw_only=True)
@@ -205,7 +204,7 @@ product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
 
 
 def zero_potentials(kernel: Matrix) -> Potentials:
-    """Return zero potentials for scores of this shape."""
+    """Return potentials of 0 for the rows and columns of a kernel."""
     # Derive them from the kernel, so that under `shard_map` they vary over devices as it does.
     row = 0 * jax.lax.stop_gradient(kernel)[..., 0]
     return Potentials(row, jnp.repeat(row[..., :1], kernel.shape[-1], axis=-1))
@@ -228,17 +227,18 @@ def marginal_error(
     *,
     capacities: bool = False,
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Compute the largest relative error of the row masses and of the column masses of a plan.
+    """Compute the largest relative errors of the row masses and of the column masses of a plan.
 
     Args:
-        log_plan: logarithms of the masses.
+        log_plan: logarithms of the plan's masses.
         log_mu: logarithms of the rows' marginals.
         log_nu: logarithms of the columns' marginals.
-        capacities: whether columns may have less than their marginals.
+        capacities: whether columns may have less than their marginals; only excess is then an
+            error.
 
     Returns:
-        The largest |mass / marginal - 1| of the rows, and of the columns. Where a marginal is 0,
-        the error is 0 if the mass is, else infinite.
+        The largest |mass / marginal - 1| over the rows, and over the columns. Where a marginal is
+        0, the error is 0 if the mass is 0 too, else infinite.
 
     Example:
         >>> import jax.numpy as jnp

@@ -37,22 +37,21 @@ class SinkhornResult(NamedTuple):
 
     log_plan: Matrix
     potentials: Potentials
-    """Potentials, in balanced transport unique up to a constant: the columns' mean is 0.
-
-    Pass them as `init` to start the next solve. Rows and columns of mass 0 have very low ones,
-    which do not count in the mean."""
+    """Dual variables divided by epsilon. In balanced entropic transport they are unique up to a
+    constant, so the columns' mean is set to 0. Pass them as `init` to start the next solve. Those
+    of rows and columns of mass 0 are very low, and do not count in the mean."""
     row_error: Float[Array, "*batch"]
-    """Largest difference between a row's mass and its marginal, relative to the marginal; a row of
-    marginal 0 has none."""
+    """Largest relative error of a row's mass: |mass / marginal - 1|, or 0 for a marginal of 0."""
     column_error: Float[Array, "*batch"]
-    """Largest relative error of a column's mass. Rows are updated last, so iterations reduce it."""
+    """Largest relative error of a column's mass. Rows are updated last, so iterations reduce it. If
+    the step has capacities, only a mass above its marginal is an error."""
     iterations: Int[Array, "*batch"]
     """Number of iterations taken."""
     converged: Bool[Array, "*batch"]
-    """Whether there is a tolerance and it was met. Both errors of a balanced entropic problem are
-    then within it, too. False without a tolerance, as convergence is then unknown."""
+    """Whether a tolerance was set and met; False without one, as convergence is then unknown. If a
+    balanced entropic problem has converged, both errors above are within the tolerance too."""
     finite: Bool[Array, "*batch"]
-    """Whether the potentials are finite."""
+    """Whether all potentials are finite."""
 
 
 def solve(
@@ -71,48 +70,48 @@ def solve(
 ) -> SinkhornResult:
     """Solve the entropic transport problem.
 
-    The plan maximises <plan, scores> + epsilon * entropy for the given marginals (paper Eq. 5). By
-    default the algorithm is the published one: three iterations of the two projections, columns
-    first and rows last, from zero potentials. Scores of half precision are widened to float32. For
-    finite scores the result is finite and does not depend on the domain: scores too far apart for
-    the scaling domain are solved again in the log domain.
+    The plan maximises <plan, scores> + epsilon * entropy for the given marginals (Eq. 5 of the
+    CriSALAD paper). By default the algorithm is the published one: three iterations from zero
+    potentials, each of which meets first the columns' marginals and then the rows'. Scores of half
+    precision are widened to float32. For finite scores the result is finite and does not depend on
+    `config.domain`: scores too far apart for the scaling domain are solved again in the log domain.
 
     Rows and columns may have a mass of 0. Their entries of the plan and their gradients are then 0,
     and the rest is as if they were left out. The logarithm of such an entry is finite, and so low
     that its exponential is 0.
 
-    Every gradient but "optimistix" works in forward and reverse mode, and has higher derivatives.
+    Every `config.gradient` but "optimistix" has forward-mode, reverse-mode and higher derivatives.
     Under `vmap` every problem is solved in both domains: put a batch in the leading axes instead.
 
     Args:
-        scores: finite; the gain of moving mass from a row to a column.
-        log_mu: logarithms of the rows' masses; -inf, or any value below -1e5, for a mass of 0.
-        log_nu: logarithms of the columns' masses. If the step is `entropic` and neither tau is
-            below 1, the masses must have the rows' total. Totals of half-precision masses may
-            differ by their rounding: the columns then get the rows' total.
-        epsilon: entropic regularisation, above 0: one for all problems of the batch, or one for
-            each. It may be traced or learnt.
-        row_tau: 1 for rows that meet their marginals; below 1 a Kullback-Leibler penalty of
-            epsilon * row_tau / (1 - row_tau) pulls them there. An array, of one value or one for
-            each problem, may be traced or learnt, and must stay below 1.
+        scores: the gain of moving mass from a row to a column; finite.
+        log_mu: logarithms of the rows' masses (required sums); -inf or below -1e5 for a mass of 0.
+        log_nu: logarithms of the columns' masses. If the step is `entropic` and both taus are 1,
+            they must have the same total as the rows' masses. Totals of half-precision masses may
+            differ by rounding: the columns' masses are then scaled to the rows' total.
+        epsilon: entropic regularisation, above 0: one value for all problems of the batch, or one
+            for each. It may be traced or learnt.
+        row_tau: 1 for rows that meet their marginals exactly; below 1 a Kullback-Leibler penalty of
+            epsilon * row_tau / (1 - row_tau) pulls their sums there. An array, of one value or one
+            for each problem, may be traced or learnt, and must stay below 1.
         column_tau: the same for columns.
-        config: step, stopping rule and gradient. Static.
+        config: step, stopping rule and gradient; a static argument.
         init: potentials to start from, such as those of an earlier result; by default those of
-            `config.start`. Those of rows and columns of mass 0 are not used.
+            `config.start`. Values for rows and columns of mass 0 are not used.
         step_params: learnt parameters of the step (`Step.init_params`).
         start_params: learnt parameters of the start (`Start.init_params`).
-        solver: an optimistix solver, if the gradient is "optimistix".
+        solver: a solver for the gradient "optimistix"; None is its plain fixed-point iteration.
 
     Returns:
         The plan's logarithm, the potentials, and how well the plan meets its marginals.
 
     Raises:
-        InputError: complex scores, shapes that do not fit, a tau out of range, or a step whose
-            potentials do not fit the problem; if values are known (outside of `jit` and `grad`),
-            scores that are not finite, an `init` with NaN, masses that are NaN or infinite or all
-            0, masses with different totals, or an epsilon that is not positive or too small; or,
-            with `config.throw`, a tolerance that was not met. Inside of `jit` the last is a
-            RuntimeError of the compiled program, raised only if it uses a value of the result.
+        InputError: complex scores; shapes that do not fit; a step or start whose potentials do not
+            fit the problem. If values are known (outside of `jit` and `grad`): scores that are not
+            finite; an `init` with NaN; masses that are NaN, infinite or all 0; different totals; a
+            tau out of range; an epsilon that is not positive or too small. With `config.throw`: a
+            tolerance that was not met; inside of `jit` it is instead a RuntimeError of the compiled
+            program, raised only if the program uses a value of the result.
 
     Example:
         >>> import jax.numpy as jnp
@@ -209,25 +208,26 @@ def assign_with_dustbin(
     patches: Float[Array, "*batch patches dim"] | None = None,
     **options: Any,
 ) -> SinkhornResult:
-    """Assign patches to clusters by transport, with a dustbin for patches that belong to none.
+    """Assign patches to clusters by transport, with a dustbin for patches without a cluster.
 
     Args:
         scores: scores of each patch for each cluster.
-        params: learnt parameters of the dustbin. "column" and "row and column": its one score;
+        params: learnt parameters of the dustbin. For "column" and "row and column": its one score;
             "token": a score per patch; "mass": the logit of the dustbin's share of all mass, where
-            the clusters share the rest equally; "none": None.
+            the clusters share the rest equally; "partial": the logit of the share that moves, or
+            None; "none": None.
         dustbin: a registered dustbin, or its name.
-        patches: features of the patches, for dustbins that use them.
-        **options: arguments of `solve`, from `epsilon` on.
+        patches: features of the patches, for a custom dustbin that uses them.
+        **options: keyword arguments of `solve`, from `epsilon` on.
 
     Returns:
-        The result of `solve`; rows of the plan are the patches, columns the clusters and then the
-        dustbin.
+        The result of `solve`. Rows of the plan are the patches; columns are the clusters and then
+        the dustbin. A row of the dustbin is left out of the plan.
 
     Raises:
-        InputError: what `solve` raises; the dustbin's mass is the number of patches minus that of
-            clusters and is not positive; the parameters do not have the dustbin's shape; or the
-            dustbin has capacities and the step does not.
+        InputError: what `solve` raises; too few patches for a dustbin whose mass is the number of
+            patches minus that of clusters; parameters of another shape; or a dustbin with
+            capacities and a step without.
 
     Example:
         >>> import jax.numpy as jnp

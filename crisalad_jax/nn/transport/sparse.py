@@ -1,4 +1,4 @@
-"""Sparse plans: quadratic transport, and the largest entries of an entropic plan's rows."""
+"""Sparse plans: quadratic transport, or the k largest entries of each row of an entropic plan."""
 
 from typing import Any
 
@@ -13,10 +13,10 @@ from crisalad_jax.nn.transport.steps import STEPS, Moved, SinkhornStep, Step, ch
 
 @STEPS.register("quadratic")
 class QuadraticStep(Step):
-    """Maximise <P, S> - epsilon / 2 * |P|^2, whose plan is sparse (Blondel et al., AISTATS 2018).
+    """Quadratic transport: maximise <P, S> - epsilon / 2 * |P|^2 (Blondel et al., AISTATS 2018).
 
-    The plan is the positive part of kernel + row + column. A half step meets one side's marginals
-    exactly, as Sinkhorn's does, by a projection onto the simplex. Problems must be balanced.
+    The plan P is sparse: the positive part of S / epsilon + row + column, for scores S. A half
+    step, a projection onto a simplex, meets one side's marginals exactly. Both taus must be 1.
 
     Example:
         >>> from crisalad_jax.sinkhorn import SinkhornConfig, solve
@@ -29,7 +29,7 @@ class QuadraticStep(Step):
         """Meet the columns' marginals, then the rows'.
 
         Raises:
-            InputError: the problem's marginals are relaxed.
+            InputError: `row_tau` or `column_tau` is below 1.
         """
         check_balanced(problem, "quadratic")
         over = problem.kernel + potentials.row[..., None]
@@ -40,20 +40,20 @@ class QuadraticStep(Step):
         return Potentials(simplex_offset(over, jnp.exp(problem.log_mu)), column), state
 
     def log_plan(self, problem: Problem, potentials: Potentials) -> Matrix:
-        """Take the positive part; an entry of 0 has a very low logarithm, without a gradient."""
+        """Return the logarithm of the plan; for an entry of 0, `EMPTY` without a gradient."""
         plan = problem.log_plan(potentials)  # kernel + row + column
         return jnp.where(plan > 0, jnp.log(jnp.where(plan > 0, plan, 1)), EMPTY)
 
 
 def simplex_offset(scores: Matrix, mass: Rows) -> Rows:
-    """Return what to add to each row so that its positive parts sum to its mass.
+    """Return the number to add to each row so that its positive entries sum to the row's mass.
 
-    This is the projection onto the simplex of this mass, sparsemax (Martins and Astudillo, ICML
-    2016).
+    The positive part is then the projection of the row onto the simplex of this mass, sparsemax
+    (Martins and Astudillo, ICML 2016).
 
     Args:
         scores: rows of numbers.
-        mass: mass of each row.
+        mass: the required sum of each row.
 
     Example:
         >>> simplex_offset(jnp.array([[1.0, 0.5, -3.0]]), jnp.ones(1)).tolist()
@@ -70,8 +70,8 @@ def simplex_offset(scores: Matrix, mass: Rows) -> Rows:
 class TopKStep(SinkhornStep):
     """Sinkhorn's step; each row of the plan keeps its k largest entries, scaled to the row's mass.
 
-    Columns then miss their marginals by what was cut, as `column_error` shows. This rounds the
-    entropic plan, and is not the best plan with that many entries.
+    Columns then miss their marginals, as `column_error` shows. The result is a rounded entropic
+    plan, not the best plan with that many entries.
     """
 
     entropic = False
@@ -79,7 +79,7 @@ class TopKStep(SinkhornStep):
     """Number of columns, the dustbin included, to which a row sends mass."""
 
     def log_plan(self, problem: Problem, potentials: Potentials) -> Matrix:
-        """Cut the plan's rows, and scale what is left."""
+        """Return the logarithm of the plan, with rows cut to k entries and rescaled."""
         log_plan = problem.log_plan(potentials)
         order = jnp.argsort(-log_plan, axis=-1)
         kept = jnp.argsort(order, axis=-1) < self.k

@@ -35,9 +35,9 @@ class Start(Part, abc.ABC):
     def potentials(self, problem: Problem, params: Any) -> Potentials:
         """Return the potentials of rows and columns to start from.
 
-        Steps update the columns first, from the rows: return rows that fit the columns
-        (`from_columns`). The gradient "unrolled" flows through the start; that of a converged
-        solution does not depend on it.
+        Steps update the column potentials first, from those of the rows, so return row potentials
+        that fit the columns (`from_columns`). With the gradient "unrolled", gradients flow through
+        the start. The gradient of a converged solution does not depend on it.
         """
 
 
@@ -45,14 +45,14 @@ STARTS = Registry("start", Start)
 
 
 def from_columns(problem: Problem, column: Columns) -> Potentials:
-    """Complete potentials of the columns with those of rows that meet their marginals.
+    """Complete column potentials with the row potentials that meet the rows' marginals.
 
     Args:
         problem: the transport problem.
         column: potentials of the columns.
 
     Returns:
-        The potentials of both.
+        The potentials of rows and columns.
 
     Example:
         >>> problem = Problem.of(jnp.eye(2), jnp.zeros(2), jnp.zeros(2))
@@ -66,28 +66,28 @@ def from_columns(problem: Problem, column: Columns) -> Potentials:
 
 @STARTS.register("zeros")
 class ZeroStart(Start):
-    """Start at zeros, as published."""
+    """Start at zero potentials, as published."""
 
     def potentials(self, problem: Problem, params: Any) -> Potentials:
-        """Return zeros."""
+        """Return potentials of 0."""
         return problem.zeros()
 
 
 @STARTS.register("gaussian")
 class GaussianStart(Start):
-    """Start at the potentials of two Gaussians, in closed form from the scores' spectrum.
+    """Start at the potentials of two Gaussians, in closed form from the scores' second moments.
 
-    Up to row and column means, scores are inner products <x_n, y_k> of vectors from their singular
-    value decomposition. If x and y were Gaussian, the entropic plan would be too, with quadratic
-    potentials (Janati et al., NeurIPS 2020; Thornton and Cuturi, AISTATS 2023, start from them).
-    With masses that sum to 1, and G the columns' weighted second moments of the scores, the
-    columns' potential is log nu - mean - (sqrt(1 + 4 G) - 1)_kk / (4 nu_k); for small scores the
-    last term is half a variance. It costs a product of the scores with themselves and an
-    eigendecomposition.
+    Apart from row and column means, scores over epsilon are inner products <x_n, y_k> of vectors
+    from their singular value decomposition. If x and y were Gaussian, the entropic plan would be
+    too, with quadratic potentials (Janati et al., NeurIPS 2020; Thornton and Cuturi, AISTATS 2023,
+    start from them). With column masses nu that sum to 1, mean_k the weighted mean score of column
+    k, and G the matrix of weighted second moments of the centred columns, column k starts at log
+    nu_k - mean_k - (sqrt(1 + 4 G) - 1)_kk / (4 nu_k). For small scores the last term is half a
+    variance. It costs a product of the scores with themselves and an eigendecomposition.
     """
 
     def potentials(self, problem: Problem, params: Any) -> Potentials:
-        """Return the guess for the columns, and the rows that fit it."""
+        """Return the guessed column potentials, and row potentials that fit them."""
         kernel = problem.kernel
         rows, columns = (jax.nn.softmax(x, axis=-1) for x in (problem.log_mu, problem.log_nu))
         mean = product("...n,...nk->...k", rows, kernel)
@@ -126,15 +126,15 @@ class NetworkStart(Start):
     """Start at Sinkhorn's first column potentials, plus a small network's output for each column.
 
     Learnt starts are from Amos et al. (Meta optimal transport, ICML 2023). For each column, the
-    network gets the first potential, and the mean, deviation and maximum of its scores; initially
-    it adds 0. It learns only with the gradient "unrolled".
+    network takes the first potential, and the mean, standard deviation and maximum of its scores.
+    Initially its output is 0. It learns only with the gradient "unrolled".
     """
 
     hidden: PositiveInt = 16
     """Width of the hidden layer."""
 
     def init_params(self, key: PRNGKeyArray) -> dict[str, Array]:
-        """Draw the hidden layer; the output layer starts at 0."""
+        """Draw the hidden layer at random; biases and the output layer start at 0."""
         return {
             "hidden": jax.random.normal(key, (4, self.hidden)) / 2,
             "bias": jnp.zeros(self.hidden),
@@ -142,7 +142,7 @@ class NetworkStart(Start):
         }
 
     def potentials(self, problem: Problem, params: dict[str, Array]) -> Potentials:
-        """Return the corrected columns, and the rows that fit them."""
+        """Return the corrected column potentials, and row potentials that fit them."""
         kernel, (row, _) = problem.kernel, problem.zeros()
         first = problem.column_tau * (problem.log_nu - problem.lse_rows(row))
         rows = jax.nn.softmax(problem.log_mu, axis=-1)

@@ -28,8 +28,8 @@ Moved = tuple[Potentials, Any]
 class Step(Part, abc.ABC):
     """One iteration of a transport solver: a frozen dataclass whose fields are its settings.
 
-    Only `step` is required. Stopping, acceleration and gradients use the methods and attributes of
-    a step, never its name.
+    A subclass must define only `step`. Stopping, acceleration and gradients use the methods and
+    attributes of a step, never its name.
 
     Example:
         >>> from crisalad_jax.sinkhorn import SinkhornConfig, register_step, solve
@@ -44,11 +44,11 @@ class Step(Part, abc.ABC):
     """
 
     entropic: ClassVar[bool] = False
-    """Whether the fixed point is the entropic plan of the problem. The closed-form gradient
-    requires it, and such a step counts as converged only if its marginals are met."""
+    """Whether the fixed point is the entropic plan of the problem. The gradient "implicit" requires
+    it, and such a step counts as converged only if the plan meets its marginals."""
     capacities: ClassVar[bool] = False
     """Whether columns may take less than their marginals. The potentials then have no free
-    constant, and a result's `column_error` is the largest excess."""
+    constant, and a result's `column_error` is the largest relative excess."""
 
     def init_params(self, key: PRNGKeyArray) -> Any:
         """Return the step's initial parameters, a pytree of arrays; by default None."""
@@ -57,13 +57,13 @@ class Step(Part, abc.ABC):
     def prepare(self, problem: Problem, params: Any) -> Problem:
         """Return the problem to solve, of the same shapes; by default the given one.
 
-        Apply learnt changes of the problem itself, such as of epsilon, here: then every gradient
-        and the plan depend on them.
+        Apply learnt changes to the problem itself, such as a learnt epsilon, here: every gradient
+        and the plan then depend on them.
         """
         return problem
 
     def init(self, problem: Problem, params: Any) -> Any:
-        """Return the state before the first iteration, a pytree; by default the parameters."""
+        """Return the state before the first iteration, a pytree; by default `params`."""
         return params
 
     @abc.abstractmethod
@@ -73,7 +73,7 @@ class Step(Part, abc.ABC):
         """Return the next potentials and state; `iteration` counts from 0."""
 
     def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
-        """Return the error to compare with the tolerance: by default the largest change.
+        """Return the error that `tolerance` limits: by default the largest change of a potential.
 
         In a balanced problem a constant that moves between rows and columns does not count. The
         rest is, to first order, the relative marginal error that the step corrected.
@@ -86,7 +86,7 @@ class Step(Part, abc.ABC):
         return jnp.maximum(jnp.abs(row).max(axis=-1), jnp.abs(column).max(axis=-1))
 
     def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
-        """Return the potentials of the plan, after the last iteration."""
+        """Return the potentials of the plan, after the last iteration; by default unchanged."""
         return potentials
 
     def log_plan(self, problem: Problem, potentials: Potentials) -> Matrix:
@@ -112,15 +112,15 @@ STEPS = Registry("step", Step, of_function=_of_function)
 
 @STEPS.register("sinkhorn")
 class SinkhornStep(Step):
-    """Meet the columns' marginals, then the rows' (paper Eq. 5).
+    """Meet the columns' marginals, then the rows' (Eq. 5 of the CriSALAD paper).
 
-    A `relaxation` of w makes each half step w times as long, in every entry where the dual
-    objective does not decrease (Thibault et al., Algorithms 2021, with one w for all entries).
+    A `relaxation` of w makes each half step w times as long, in every entry where that does not
+    lower the dual objective (Thibault et al., Algorithms 2021, with one w for all entries).
     """
 
     entropic: ClassVar[bool] = True
     relaxation: float = 1.0
-    """Factor of the length of each half step, from 1 to less than 2."""
+    """Factor on the length of each half step, from 1 (plain Sinkhorn) to less than 2."""
 
     def __post_init__(self) -> None:
         """Check the range."""
@@ -128,7 +128,7 @@ class SinkhornStep(Step):
         require_field(self, "relaxation", fits, "from 1 to less than 2")
 
     def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
-        """Take both half steps."""
+        """Update the column potentials, then the row potentials."""
         column = problem.column_tau * (problem.log_nu - problem.lse_rows(potentials.row))
         column = self._further(potentials.column, column, problem.column_tau)
         row = problem.row_tau * (problem.log_mu - problem.lse_columns(column))
@@ -150,9 +150,9 @@ class SinkhornStep(Step):
         return jnp.where(gain >= 0, new + beyond, new)
 
     def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
-        """Project onto the rows' marginals, which a relaxed step may have left.
+        """Meet the rows' marginals again, as a relaxed step may miss them.
 
-        Without the projection the rows' masses could overflow.
+        Otherwise the rows' masses could overflow.
         """
         if self.relaxation == 1:
             return potentials
@@ -163,23 +163,23 @@ class SinkhornStep(Step):
 LONGEST = (8.0, 2.0, 0.5)
 """Largest changes of a potential that Newton's step tries, in multiples of the temperature."""
 COOLING = 1.5
-"""Factor between temperatures of Newton's step."""
+"""Factor between successive temperatures of Newton's step."""
 FAR = 3.0
-"""Largest error of a column's log mass at the temperature that Newton's step starts at."""
+"""Largest error of a column's log mass at the temperature at which Newton's step starts."""
 HOTTEST = 1e12
-"""Temperature at which the search for one ends, for scores that are not finite."""
+"""Temperature at which the search for a first temperature ends, if scores are not finite."""
 
 
 @STEPS.register("newton")
 class NewtonStep(Step):
     """Newton's method on the semi-dual, a concave function of only the column potentials.
 
-    The rows' marginals are always met (Brauer et al., 2017), and the Hessian is a weighted graph
-    Laplacian between columns. Of Sinkhorn's change of the potentials and Newton's, clipped to
-    several lengths, the step takes the one with the largest semi-dual, which therefore never falls.
+    The rows' marginals are always met (Brauer et al., 2017), and the Hessian is the Laplacian of a
+    weighted graph of the columns. Of Sinkhorn's change of the potentials, and Newton's clipped to
+    several lengths, a step takes the one with the largest semi-dual, which therefore never falls.
 
-    If scores are too sharp to begin with, epsilon is first multiplied by a temperature, which falls
-    to 1 as the errors do. The step's state is the next temperature. Problems must be balanced.
+    If scores differ by too many epsilons, epsilon is at first multiplied by a temperature, which
+    falls to 1 as the errors fall. The step's state is the next temperature. Both taus must be 1.
     """
 
     entropic: ClassVar[bool] = True
@@ -189,10 +189,10 @@ class NewtonStep(Step):
         return 0 * problem.log_mu[..., 0] + 1
 
     def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
-        """Take the best of four steps at the state's temperature.
+        """Take the best of four changes of the potentials, at the temperature in `state`.
 
         Raises:
-            InputError: the problem's marginals are relaxed.
+            InputError: `row_tau` or `column_tau` is below 1.
         """
         check_balanced(problem, "newton")
         temperature = jax.lax.stop_gradient(state)
@@ -211,7 +211,7 @@ class NewtonStep(Step):
         return Potentials(row, column), lower
 
     def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
-        """Return the remaining marginal error: far from the solution a step may be small."""
+        """Return the remaining marginal error: far from the solution a change may be small."""
         return _marginal_error(problem, new)
 
 
@@ -252,7 +252,7 @@ def _cooled(temperature: Array, newton: Array, error: Array) -> Array:
 
 @STEPS.register("softmax")
 class SoftmaxStep(Step):
-    """Distribute every row by a softmax: a baseline without transport."""
+    """Distribute the mass of every row by a softmax: a baseline without transport."""
 
     def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Meet the rows' marginals, and ignore the columns'."""
@@ -262,7 +262,7 @@ class SoftmaxStep(Step):
 
 @STEPS.register("dual-softmax")
 class DualSoftmaxStep(Step):
-    """Multiply a softmax of the rows by one of the columns: a baseline without transport."""
+    """Multiply a softmax over each row by one over each column: a baseline without transport."""
 
     def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Normalise rows and columns, independently of each other."""
@@ -270,7 +270,7 @@ class DualSoftmaxStep(Step):
         return Potentials(-problem.lse_columns(column), -problem.lse_rows(row)), state
 
     def log_plan(self, problem: Problem, potentials: Potentials) -> Matrix:
-        """Return the sum of both log-softmaxes."""
+        """Return the sum of the log-softmaxes of rows and columns."""
         return problem.kernel + problem.log_plan(potentials)
 
 
@@ -294,7 +294,7 @@ def _temperature(problem: Problem, column: Array, current: Array, is_first: Arra
 
 
 def check_balanced(problem: Problem, name: str) -> None:
-    """Check that a problem has no relaxed marginals, for a step that needs balanced problems."""
+    """Raise InputError if a tau of the problem is below 1, for the step with this name."""
     require(
         problem.balanced,
         f"step {name}: found relaxed marginals, expected row_tau 1 and column_tau 1: it is for "
@@ -303,7 +303,7 @@ def check_balanced(problem: Problem, name: str) -> None:
 
 
 def tempered(problem: Problem, temperature: Float[Array, "*batch"]) -> Problem:
-    """Return a balanced problem at a multiple of its epsilon, in the same domain."""
+    """Return a balanced problem with epsilon multiplied by `temperature`, in the same domain."""
     by = temperature[..., None]
     clusters, last = problem.clusters / by[..., None], problem.last / by
     smooth = Problem(clusters, last, problem.log_mu, problem.log_nu)
@@ -334,13 +334,13 @@ def solve_columns(
 ) -> Columns:
     """Solve the columns' part of the linearised optimality conditions.
 
-    The matrix is diag(masses / column_tau) - row_tau * shares^T plan. It is written as a Laplacian,
-    which avoids cancellation. If both sides are balanced, the unknown of the heaviest column is 0:
-    with that of a column without mass at 0, the matrix would be singular.
+    The matrix is diag(masses / column_tau) - row_tau * shares^T plan, with the plan's column sums
+    as masses, written as a Laplacian to avoid cancellation. If both taus are 1, the unknown of the
+    heaviest column is set to 0: with that of a column without mass, the matrix would be singular.
 
     Args:
-        plan: masses.
-        shares: each row's masses divided by their sum.
+        plan: the plan's masses.
+        shares: the plan with each row divided by its sum.
         target: the right-hand side.
         row_tau: see `Problem`.
         column_tau: see `Problem`.

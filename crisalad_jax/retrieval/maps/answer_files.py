@@ -23,7 +23,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import printable
 
 POSITION_SUFFIXES = (".csv", ".geojson", ".gpx", ".kml")
-"""Suffixes of files that have positions."""
+"""Suffixes of answer files that contain positions."""
 _DECIMALS = 9
 """Decimal places of degrees: a tenth of a millimetre."""
 
@@ -45,13 +45,13 @@ def format_answers(path: str | os.PathLike[str], answers: Answers) -> tuple[str,
     """Format answers according to the file's suffix.
 
     JSON holds all answers: one line per query (.jsonl, or any other suffix) or a list (.json). The
-    other formats hold the best answer's position: .csv in the map's axes, for `--positions`;
-    .geojson, .gpx and .kml in degrees. GPX is a track if all names contain seconds since 1970. A
-    query of an unknown place, or whose answer has no position, has no geometry in GeoJSON and is
-    left out of CSV, GPX and KML.
+    other formats hold the position of each query's best answer: .csv in the map's axes, as
+    `--positions` reads it; .geojson, .gpx and .kml in degrees. GPX is a track if the names of all
+    its queries contain seconds since 1970. A query of an unknown place, or whose best answer has no
+    position, has no geometry in GeoJSON and is left out of CSV, GPX and KML.
 
     Args:
-        path: the file.
+        path: the file that the text is for; only its suffix matters.
         answers: what `query` found.
 
     Returns:
@@ -70,9 +70,9 @@ def check_positions(
     """Check that a map has the positions that an answer file needs.
 
     Args:
-        path: the file.
-        axes: axes of the map's positions.
-        zone: the map's UTM zone.
+        path: the answer file; only its suffix matters.
+        axes: axes of the map's positions; None if it has none.
+        zone: the map's UTM zone; None if unknown.
 
     Raises:
         InputError: the map has no positions, or the file needs degrees and the map's UTM zone is

@@ -68,12 +68,11 @@ class AppendableMap(Map):
         """Append images atomically: once this returns, all of them are stored; before, none are.
 
         Args:
-            names: names relative to `root` that are not in the map yet.
+            names: paths of the images relative to `root`, none of them in the map yet.
             sizes: sizes of their files, in bytes.
             descriptors: unit vectors, or anything else `search` takes; stored in the map's type.
             root: the folder of these images.
-            positions: where they were taken, as far as known; those of another UTM zone are
-                converted to the map's.
+            positions: where they were taken, as far as known; converted to the map's UTM zone.
 
         Raises:
             InputError: a name is in the map already or given twice, descriptors are not unit
@@ -94,17 +93,16 @@ class AppendableMap(Map):
     ) -> None:
         """Remove, move and append images in one atomic change.
 
-        The images that are left are renumbered.
+        The remaining images are renumbered from 0, in order.
 
         Args:
-            verb: the reason. "replace" also removes images with the names of those that are added.
+            verb: the reason, which is recorded. "replace" also removes images named in `added`.
             removed: indices of the images to remove.
-            moved: new positions by image name, as `fitted_anew` returns them.
+            moved: new positions by image name, as `fitted_anew` returns them; None moves no image.
             added: new images.
 
         Raises:
-            InputError: no image would be left, more than `MOST_CHANGED` would change, or what
-                `append` raises.
+            InputError: no image is left, more than `MOST_CHANGED` change, or as in `append`.
         """
         self._check_there()
         gone = set(removed)
@@ -148,7 +146,9 @@ class AppendableMap(Map):
         self._segments.change(record, parts())
 
     def fitted_anew(self, positions: Positions) -> Positions:
-        """Return new positions in the map's axes and zone, or in theirs if no other image has any.
+        """Convert new positions of images to the map's axes and zone.
+
+        Other axes are left as they are if no other image has a position.
 
         Raises:
             InputError: they don't fit the map's axes or zone, see `Positions.fitted`.
@@ -215,12 +215,12 @@ def open_for_appending(
     """Open the map with this metadata for appending, or create it with these components.
 
     One process at a time may append, while others search. A map that a kill left without images is
-    created again; one that an exception leaves without images is removed. Descriptors without a
+    created again; if an exception leaves it without images, it is removed. Descriptors without a
     record are removed with a warning.
 
     Raises:
-        InputError: another process is appending, the folder holds a different map or one that has
-            lost a record of images, what `Map.open` raises, or the folder cannot be written to.
+        InputError: another process is appending; the folder holds a different map, or one that has
+            lost a record of images; what `Map.open` raises; or the folder cannot be written to.
     """
     folder = pathlib.Path(folder)
     read_metadata(folder)  # raises if something else is there, before anything is created

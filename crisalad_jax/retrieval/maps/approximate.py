@@ -1,8 +1,8 @@
 """Approximate search of a map: a FAISS index built from its descriptors, or the index of Milvus.
 
-The index's name contains a digest of the additions that it was built from. An index of other
-additions is not used, so a map that has grown never answers from an old one. Building extends an
-existing index of the first additions by the new ones.
+The name of a FAISS index contains a digest of the additions that it was built from. An index of
+other additions is not used, so a map that has grown never answers from an old one. If an index of
+the first additions exists, building extends it by the new ones.
 """
 
 import hashlib
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
 SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq"))
-"""How a map in files is searched: as `choose_search` chooses; by comparing every descriptor; by a
-graph over the descriptors, all in memory; or by their signs in memory, with answers ranked from the
-files."""
+"""How to search a map in files: "auto" is what `choose_search` chooses; "exact" compares every
+descriptor; "hnsw" follows a graph of the descriptors in memory; "ivf-rabitq" compares their signs
+in memory, and ranks the best by the descriptors in the files."""
 _EXACT_BYTES = 2**26
 """Largest size of descriptors that `choose_search` searches exactly: a query reads all of them, in
 less than a tenth of a second."""
@@ -50,7 +50,7 @@ _SEARCHED = 10
 """The index is searched only if at least one in this many descriptors is left."""
 _SEED = 0
 Additions = Sequence[tuple[int, int, str]]
-"""First number, count and SHA-256 of each addition to a map."""
+"""Number of the first descriptor, count and SHA-256 of each addition to a map."""
 
 
 class Approximate(NamedTuple):
@@ -58,18 +58,18 @@ class Approximate(NamedTuple):
 
     kind: str
     ask: Callable[[Queries, int, int, Removed], Neighbours]
-    """Finds k candidates among `count` descriptors; missing ones are -1."""
+    """Returns k candidates per query from (queries, k, count, removed); missing ones are -1."""
     store: Store
     recall: float
-    """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
+    """Share of the exact neighbours found at building (`NEIGHBOURS`, `SAMPLE`); NaN if unknown."""
     is_served: bool = False
-    """Whether a server searches for candidates among what is left, however few."""
+    """Whether Milvus finds the candidates, however few descriptors are left after removals."""
 
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors by ranking candidates exactly.
 
-        Queries with fewer than k candidates are searched exactly, and so are files of which less
-        than a tenth is left. Removed descriptors are never candidates; others take their place.
+        Queries with fewer than k candidates are searched exactly, as are maps in files with less
+        than a tenth left. Removed descriptors are never candidates; others take their place.
 
         Raises:
             InputError: the store is damaged or gone.
@@ -95,10 +95,10 @@ class Approximate(NamedTuple):
 def open_approximate(
     folder: pathlib.Path, segments: Segments, *, verify: bool
 ) -> Approximate | None:
-    """Open the approximate search of the map in `folder`; None if there is none of these images.
+    """Open the approximate search of the map in `folder`; None if it has none for `segments`.
 
     Raises:
-        InputError: it is damaged or, if `verify` is set, has changed.
+        InputError: its index is damaged or, if `verify` is set, has changed.
     """
     if isinstance(segments.store, MilvusStore):
         return _served(segments.store)
@@ -122,7 +122,7 @@ def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
 
 
 def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
-    """Return the kind of an approximate search that is outdated; None if none is."""
+    """Return the kind of an outdated approximate search in a map's folder; None without one."""
     found = _indices(folder)
     if not found or _current(folder, additions) is not None:
         return None
@@ -130,7 +130,7 @@ def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
 
 
 def check_search(kind: str, store: str, dtype: str) -> None:
-    """Check that a store supports this kind of search of its descriptors.
+    """Check that a store supports this kind of search for descriptors of type `dtype`.
 
     Raises:
         InputError: the store does not have this kind, or it is an approximate search of bits.
@@ -145,8 +145,8 @@ def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
 
     Args:
         count: number of descriptors.
-        length: length of each.
-        dtype: type that they are stored as.
+        length: number of dimensions of each.
+        dtype: type that they are stored as: "float32", "float16" or "bits".
 
     Returns:
         One of `SEARCHES`, and why it was chosen.
@@ -165,16 +165,16 @@ def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
 def build_approximate(
     folder: pathlib.Path, kind: str, segments: Segments, *, quiet: bool = True
 ) -> Approximate | None:
-    """Build or extend the approximate search of a map; "exact" removes any.
+    """Build or extend the approximate search of a map; "exact" removes it, and returns None.
 
     Args:
         folder: the map's folder, whose lock is held.
-        kind: one of `SEARCHES` that `check_search` accepts.
+        kind: one that `check_search` accepts; "auto" only for Milvus.
         segments: the map's descriptors.
         quiet: whether to hide the progress bar.
 
     Raises:
-        InputError: an index of fewer images is damaged, or the disk is full.
+        InputError: an index that would be extended is damaged, or the disk is full.
     """
     count, store = len(segments), segments.store
     if isinstance(store, MilvusStore):

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 @brief
 class Indexed(NamedTuple):
-    """Counts and names of a folder's images after indexing it."""
+    """Counts and names of images after indexing a folder."""
 
     added: int
     there: int
@@ -54,7 +54,7 @@ class Indexed(NamedTuple):
     positions: int
     """Number of added images whose position is known."""
     stay: int
-    """Number of given positions not used, as the map had these images already."""
+    """Number of given positions that were not used, as the map had their images already."""
     unreadable: list[str]
     """Names of the images that could not be read."""
     unmatched: list[str]
@@ -63,9 +63,9 @@ class Indexed(NamedTuple):
     """Number of images that the map has now."""
     metadata: MapMetadata
     recall: float | None = None
-    """Recall of the approximate search, see `Map.build_search`; None if none was requested."""
+    """Recall of the approximate search, see `Map.build_search`; None without one."""
     removed: int = 0
-    """Number of images that were removed from the map, and stay out."""
+    """Number of images that were removed from the map before, and were not added again."""
     near: int = 0
     """Number of images left out by `every_metres`."""
     similar: int = 0
@@ -133,28 +133,28 @@ def index(
     The same call resumes after a kill.
 
     Args:
-        model: a model from `load`, or a `Runtime`, with the image size and compute dtype of an
-            existing map.
+        model: a model from `load`, or a `Runtime`. An existing map needs the model that made it,
+            with the same image size and compute dtype.
         images: a folder, searched with its subfolders, or another source of images
             (docs/how-to/image-sources.md); the map names images by their paths in it.
         out: the map's folder.
         weights: the file that the parameters come from, which queries load by default.
-        fps: frames per second, if `images` is a video or log; None is 1.
+        fps: frames per second to take from a video or robot log; None is 1.
         topic: the image topic of a robot log; None takes the only one.
-        position_topic: the topic of positions in a log; see `open_source`.
+        position_topic: the topic of positions in a log; "none" takes none (see `open_source`).
         positions: where images were taken, or a table or track of positions (`read_track`). None
             takes them from `images`, if that is a table or a robot log; else from @UTM names; else
-            from the EXIF data of JPEGs. Names in several UTM zones become degrees, or metres in
-            the map's zone.
-        every_metres: minimum distance from the last selected image of the same folder or video;
-            nearer images are left out, those without a position are not. None takes all.
+            from the EXIF data of JPEGs. Names in several UTM zones become degrees, or metres in the
+            map's zone.
+        every_metres: minimum distance in metres from the last selected image of the same folder or
+            video. Nearer images are left out; images without a position are not. None takes all.
         novelty: maximum cosine similarity to the last selected image of the same folder or video;
             more similar images are left out, as from a robot that stands still. None takes all.
         store: "files", or "milvus:URI". None is the existing map's, or "files" for a new map.
         dtype: type of the stored descriptors; "bits" stores their signs (`pack_bits`), which are
             searched by Hamming distance. None is the existing map's, or "float32" for a new map.
-        pca: components that shorten the descriptors, or a file of them; the map stores a copy. None
-            is the existing map's, or none for a new map.
+        pca: components from `fit_pca` that shorten the descriptors, or their file; the map stores a
+            copy. None is the existing map's, or none for a new map.
         search: the approximate search to build, or to extend by new descriptors; see
             `Map.build_search`. "exact" removes an existing one. None leaves it unchanged, and once
             the map has grown it is no longer used.
@@ -167,9 +167,9 @@ def index(
 
     Raises:
         InputError: parameters of another configuration; no image, or none that can be read;
-            positions that match none of them; a distance or similarity out of range; a map of
-            another model or of other settings; what `AppendableMap.append`, `new_metadata` and
-            `open_for_appending` raise.
+            positions that match none of them; a number out of range; a map of another model or of
+            other settings, that another process is changing, or that cannot be written to; a name
+            that the map has for another image; or descriptors that are not unit vectors.
 
     Example:
         >>> import jax
@@ -322,7 +322,7 @@ def check_settings(
     store: str | None = None,
     pca: Pca | None = None,
 ) -> None:
-    """Check that a model's configuration and the given settings agree with an existing map."""
+    """Raise InputError if a configuration or given setting differs from that of an existing map."""
     if store is not None:
         check_store(store, metadata.dtype)
     there = model_config(metadata, folder)

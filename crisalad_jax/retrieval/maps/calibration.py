@@ -11,19 +11,19 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 
 CALIBRATION = "calibration.json"
-"""Name of the file, next to the map's description."""
+"""Name of the file of a calibration by similarity, in the map's folder."""
 VERIFIED = "calibration-verified.json"
-"""The same for verified answers, which count by their inliers."""
+"""Name of the file for verified answers, which count by their number of inliers."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """The contents of either file: an operating point, and what it was measured on."""
+    """The contents of a calibration file: an operating point, and what it was measured on."""
 
     min_similarity: float
-    """A query is of an unknown place if no image of the map is this similar to it."""
+    """A query is of an unknown place if no image of the map has at least this cosine similarity."""
     precision: float
-    """The precision that was asked for, as a fraction."""
+    """Requested precision, as a fraction: the share of answers that should be correct."""
     answered: int
     """Number of queries that were answered, `right` of them correctly."""
     right: int
@@ -37,9 +37,9 @@ class Calibration:
     benchmark: str
     """Name of the evaluation set."""
     rule: str
-    """What counted as correct."""
+    """What counted as a correct answer, in words."""
     model: str
-    """The `model_hash` of the map, and so of the descriptors that were compared."""
+    """The `model_hash` of the model that made the map and the compared descriptors."""
     created: str = ""
     min_inliers: int = 0
     """For verified answers: a query whose best answer has fewer inliers is of an unknown place;
@@ -65,7 +65,7 @@ def read_calibration(
         name: name of the file, `CALIBRATION` or `VERIFIED`.
 
     Raises:
-        InputError: the file is damaged, of another format, or of another model than the map's.
+        InputError: the file is damaged, of another format, or for another model than the map's.
     """
     path = folder / name
     if not path.exists():
@@ -97,5 +97,5 @@ def write_calibration(folder: pathlib.Path, calibration: Calibration) -> None:
 
 
 def check_min_similarity(value: float, name: str = "min_similarity") -> None:
-    """Raise InputError unless a similarity is a cosine."""
+    """Raise InputError unless a cosine similarity is from -1 to 1; the message calls it `name`."""
     require(-1 <= value <= 1, f"{name}: found similarity {value}, expected one from -1 to 1")

@@ -22,15 +22,15 @@ class MapAddition(NamedTuple):
     """Images that were appended to a map from one folder on one day."""
 
     day: str | None
-    """The day, as YYYY-MM-DD in UTC; None if its record has none."""
+    """The day, as YYYY-MM-DD in UTC; None if it was not recorded."""
     root: str
-    """The folder that their names are relative to."""
+    """The folder that names of its images are relative to."""
     images: int
-    """Number of its images that were not removed."""
+    """Number of its images that have not been removed."""
 
 
 def additions_of(images: "Images") -> list[MapAddition]:
-    """Group the parts of a map's images into additions by day and root."""
+    """Group a map's images into additions: consecutive ones of the same day and folder."""
     counts = np.diff(images.starts).tolist()
     days = ((part.added and part.added[:10], part.root) for part in images.parts)
     return [
@@ -46,12 +46,12 @@ def contents(places: "Map", chosen: "Sequence[MapImage] | None" = None) -> dict[
 
     Args:
         places: the map.
-        chosen: images to which the folders and the extent are limited; None is all.
+        chosen: images to which `folders` and `extent` are limited; None is all.
 
     Returns:
-        `folders`: each folder below a root, or video, with its number of images and, if all of
-        their names contain times, the first and the last (in seconds of a video, else in UTC);
-        `additions`; `extent`: the minimum and maximum position on each axis, or None.
+        `folders`: each folder below a root, or video, with its number of images and, if all their
+        names contain times, the first and last time (seconds into a video, else UTC); `additions`:
+        see `Map.additions`; `extent`: the minimum and maximum position on each axis, or None.
     """
     folders: dict[str, list[Moment | None]] = collections.defaultdict(list)
     images = places.images if chosen is None else chosen

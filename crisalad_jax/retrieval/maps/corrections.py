@@ -68,13 +68,13 @@ class MapChange(NamedTuple):
     stay_out: int = 0
     """Number of images that were removed from the map before, and are not merged into it."""
     stale_search: str | None = None
-    """Kind of the approximate search, if its index lacks images and so is not used."""
+    """Kind of an approximate search that is unused, as its index lacks images; None otherwise."""
 
 
 def find_images(
     places: Map, patterns: Sequence[str], addition: int | None = None, day: str | None = None
 ) -> tuple[list[int], int]:
-    """Find images by name or pattern, among all or those of an addition or a day.
+    """Find images by name or pattern, as in `remove_images`; without patterns, find all.
 
     Returns:
         Their numbers in order, and how many of the named images had been removed before.
@@ -130,16 +130,16 @@ def remove_images(
     Args:
         folder: the map's folder.
         names: names of images, or patterns such as "monday/*", where * matches any characters, ?
-            matches one, and [ab] matches a or b.
+            matches one, and [ab] matches a or b. Optional with `addition` or `day`.
         addition: only images of this addition, counted from 1 in `Map.additions`.
-        day: only images that were added on this day, as YYYY-MM-DD.
+        day: only images that were added on this day, as YYYY-MM-DD in UTC.
 
     Returns:
         What was removed.
 
     Raises:
-        InputError: nothing is named; a name, pattern, addition or day that matches no image; no
-            image would be left; or what `open_for_appending` raises.
+        InputError: no name, addition or day is given; one of these matches no image; no image would
+            be left; or the map cannot be opened for changes.
 
     Example:
         >>> import jax
@@ -181,15 +181,15 @@ def replace_images(
         images: where the files are, as in `index`.
         folder: the map's folder.
         weights: the file that the parameters come from, for messages.
-        fps: frames per second to take from videos.
+        fps: frames per second to take from videos; None is 1.
         reading: how images are read.
 
     Returns:
-        What was replaced; `unmatched` are images that the map does not have.
+        What was replaced; `unmatched` lists names in `images` that the map does not have.
 
     Raises:
         InputError: another model; no image whose name is in the map; an unreadable image under
-            "stop", or only such images; or what `open_for_appending` raises.
+            "stop", or no readable one; or the map cannot be opened for changes.
 
     Example:
         >>> import cv2, jax
@@ -257,8 +257,8 @@ def move_images(
 ) -> MapChange:
     """Give images of a map new positions, such as poses after SLAM.
 
-    Positions are converted to the map's axes and zone. Other axes are allowed if no other image of
-    the map has a position.
+    Positions are converted to the map's axes and UTM zone. They may have other axes if no other
+    image of the map has a position.
 
     Args:
         folder: the map's folder.
@@ -269,7 +269,7 @@ def move_images(
 
     Raises:
         InputError: positions that match none of the images, or don't fit the map's axes or zone; or
-            what `open_for_appending` raises.
+            the map cannot be opened for changes.
 
     Example:
         >>> import jax
@@ -308,7 +308,7 @@ def merge_maps(
 ) -> MapChange:
     """Merge maps of the same model and settings into a map, which is created if it is missing.
 
-    Removed images, of the others or of the map, stay out. The rest keep their folders and dates.
+    Images removed from their map or from `folder` stay out. The rest keep their folders and dates.
 
     Args:
         folder: the map's folder.
@@ -321,9 +321,9 @@ def merge_maps(
         What was appended.
 
     Raises:
-        InputError: maps of different models or settings; a name that two images have; positions
-            that don't fit the map's axes or zone; another store than the map's; or what `Map.open`
-            and `open_for_appending` raise.
+        InputError: maps of different models or settings; a name that two different images have;
+            positions that don't fit the map's axes or zone; another store than the map's; or a map
+            that cannot be opened.
 
     Example:
         >>> import jax

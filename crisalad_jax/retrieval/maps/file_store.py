@@ -2,6 +2,7 @@
 
 import functools
 import math
+import os
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -42,6 +43,7 @@ class FileStore:
     def __init__(self, folder: pathlib.Path, length: int, dtype: str) -> None:
         """Open a folder of descriptors of this length; the first `add` creates the folder."""
         self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
+        self._opened_at: os.stat_result | None = None
         self._counts: dict[int, int] = {}
         """Number of descriptors in each file, by the number of its first, in ascending order."""
         self._held: tuple[int, Removed, Block] | None = None
@@ -55,9 +57,9 @@ class FileStore:
         """Write descriptors numbered from `first` on; they are durable once this returns.
 
         Args:
-            first: number of the first.
+            first: number of the first descriptor.
             descriptors: the descriptors, in order.
-            record: the record of their images, which search conditions refer to.
+            record: the record of their images, which only Milvus stores, for search conditions.
         """
         del record  # the map stores it
         path = self._path(first)
@@ -66,13 +68,13 @@ class FileStore:
         self._counts[first], self._held = len(descriptors), None
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
-        """Check that all additions, as (first, count), exist, without reading them."""
+        """Check that all additions, each as (first number, count), exist, without reading them."""
         for first, count in segments:
             self._counts[first] = count
             self._open(first)
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
-        """Read the descriptors that were added together, numbered from `first` on."""
+        """Read the `count` descriptors that were added together, numbered from `first` on."""
         return np.array(self._open(first))
 
     def _open(self, first: int) -> Descriptors:
@@ -83,6 +85,10 @@ class FileStore:
         size = len(header) + math.prod(shape) * self._dtype.itemsize
         with path.open("rb") as file:
             begins = file.read(len(header))
+        at = os.stat(self._folder)
+        self._opened_at = self._opened_at or at
+        if not os.path.samestat(at, self._opened_at):
+            raise InputError(f"{self._folder}: the map was replaced since it was opened")
         if begins != header or path.stat().st_size != size:
             raise InputError(
                 f"{path}: found bytes other than {self._dtype} {shape}, expected the whole .npy "
@@ -92,7 +98,7 @@ class FileStore:
         return np.memmap(path, self._dtype, "r", len(header), shape).view(np.ndarray)
 
     def drop(self, first: int) -> None:
-        """Delete what was added from number `first` on, which was never committed."""
+        """Delete descriptors from number `first` on, whose addition was never committed."""
         for path in self._folder.glob("[0-9]*.npy"):
             if int(path.stem) >= first:
                 path.unlink()
@@ -109,9 +115,9 @@ class FileStore:
 
         Args:
             queries: unit vectors or packed bits.
-            k: neighbours per query, from 1 to as many as are left.
+            k: neighbours per query, from 1 to the number of descriptors that are left.
             count: number of descriptors, including removed ones.
-            removed: descriptors to leave out; the result numbers the rest as `Removed` does.
+            removed: descriptors to leave out; the result numbers the rest from 0, in order.
         """
         if self._dtype == BITS:
             parts = (
@@ -154,7 +160,7 @@ class FileStore:
 
         Args:
             numbers: numbers of descriptors, in any order.
-            release: whether to release the pages that are read; numbers must then be in order.
+            release: whether to release the pages that are read; numbers must then be ascending.
 
         Raises:
             InputError: a file is damaged or gone.

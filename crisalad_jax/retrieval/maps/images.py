@@ -30,10 +30,11 @@ class MapImage(NamedTuple):
     """An image of a map: everything but its descriptor."""
 
     name: str
-    """Its posix path relative to `root`; no two images of a map share one."""
+    """Its path relative to the folder `root`, with forward slashes; unique in a map."""
     bytes: int
     """Size of the described file in bytes; a file of another size counts as another picture."""
     position: tuple[float, float] | None
+    """Where it was taken, in the map's axes (`Map.axes`); None if unknown."""
     root: str
 
 
@@ -46,12 +47,12 @@ class NewImages(NamedTuple):
     root: str
     positions: Positions | None = None
     added: str | None = None
-    """The time when they were described; None is now."""
+    """ISO 8601 time when they were described; None is now."""
     source: object = None
-    """Their name in messages; None is their root."""
+    """What messages call them; None is their root."""
 
     def only(self, chosen: Sequence[bool]) -> "NewImages":
-        """Return only the chosen images."""
+        """Return only the images for which `chosen` is True, in order."""
         names, sizes = (list(itertools.compress(x, chosen)) for x in (self.names, self.sizes))
         rows = self.descriptors[np.array(chosen)]
         return self._replace(names=names, sizes=sizes, descriptors=rows)
@@ -64,9 +65,9 @@ class Part(NamedTuple):
     """When the images were added, as text; None if their record has no time."""
     root: str
     first: int
-    """Their first row."""
+    """Row of the first of these images."""
     seconds: float
-    """The time in seconds since 1970, NaN without one."""
+    """`added` in seconds since 1970; NaN without a time."""
 
 
 class _Column:
@@ -102,7 +103,7 @@ class Images(Sequence[MapImage]):
         self.removed = NONE
         """The removed images, by their rows in the store, which no change alters."""
         self.parts: list[Part] = []
-        """The images that were appended together, in order."""
+        """The parts, each of images that were appended together, in order."""
         self._firsts, self._ends, self._hashes, self._sizes = (_Column(np.int64) for _ in range(4))
         self._names, self._taken = _Column(np.uint8), _Column(np.float64)
         self._positions = _Column(np.float64, 2)
@@ -163,7 +164,7 @@ class Images(Sequence[MapImage]):
         return self.removed.numbers_of(np.append(self._firsts.values, self.rows)).tolist()
 
     def part_of(self, number: int) -> Part:
-        """Return the part that an image belongs to."""
+        """Return the part that the image with this number belongs to."""
         row = self.removed.rows_of(np.array(number))
         return self.parts[int(np.searchsorted(self._firsts.values, row, side="right")) - 1]
 
@@ -183,7 +184,7 @@ class Images(Sequence[MapImage]):
 
     @functools.cached_property
     def removed_names(self) -> dict[str, set[int]]:
-        """Names of the images that were removed or replaced, with the sizes of their files."""
+        """Names of removed or replaced images, each with the sizes of its files in bytes."""
         sizes: dict[str, set[int]] = {}
         for image in self.in_rows(self.removed.rows):
             sizes.setdefault(image.name, set()).add(image.bytes)
@@ -198,7 +199,7 @@ class Images(Sequence[MapImage]):
         positions: Sequence[Sequence[float] | None],
         axes: tuple[str, str] | None,
     ) -> None:
-        """Append images with unique names.
+        """Append images with unique names; `names`, `sizes` and `positions` have an item for each.
 
         Raises:
             ValueError, TypeError, OverflowError: a value is of another type or out of range, or a
@@ -240,7 +241,7 @@ class Images(Sequence[MapImage]):
         self._recent = {}
 
     def twice(self) -> int | None:
-        """Return a row whose image has the same name as another; None if there is none."""
+        """Return the row of an image whose name is in another row too; None if there is none."""
         self._sort()
         left = self._order[~self._mask(self.removed.rows)[self._order]]
         hashes = self._hashes.values[left]
@@ -262,7 +263,7 @@ class Images(Sequence[MapImage]):
         positions: Sequence[Sequence[float]],
         axes: tuple[str, str] | None,
     ) -> "Images":
-        """Return the images without those in some rows, and with others moved.
+        """Return a copy without rows `removed`, and with rows `moved` at the new `positions`.
 
         Raises:
             ValueError, TypeError, OverflowError: rows beyond the last, or as in `extend`.
@@ -284,7 +285,7 @@ class Images(Sequence[MapImage]):
         return new
 
     def left_out(self, mask: Bool[np.ndarray, " row"]) -> Removed:
-        """Return the rows that are removed or outside a mask."""
+        """Return the rows that were removed, or where a mask is False."""
         return Removed(np.flatnonzero(~mask | self._mask(self.removed.rows)))
 
     def begin_with(self, prefixes: Iterable[str]) -> Bool[np.ndarray, " row"]:
@@ -300,18 +301,18 @@ class Images(Sequence[MapImage]):
 
     @property
     def positions(self) -> Float64[np.ndarray, "row 2"]:
-        """Position of each row, NaN where it has none."""
+        """Position of the image in each row, NaN if it has none."""
         return self._positions.values
 
     @property
     def added(self) -> Float64[np.ndarray, " row"]:
-        """When each row was added, in seconds since 1970, NaN if its record does not say."""
+        """When the image in each row was added, in seconds since 1970; NaN if not recorded."""
         times = [part.seconds for part in self.parts]
         return np.repeat(times, np.diff(np.append(self._firsts.values, self.rows)))
 
     @property
     def taken(self) -> Float64[np.ndarray, " row"]:
-        """When each row was taken, in seconds since 1970, NaN if its name does not say."""
+        """When the image in each row was taken, in seconds since 1970; NaN if not in its name."""
         known = len(self._taken.values)
         moments = map(moment_of, self._named(np.arange(known, self.rows)))
         self._taken.extend([np.nan if at is None or at.clock else at.seconds for at in moments])
@@ -321,11 +322,10 @@ class Images(Sequence[MapImage]):
 def checked_positions(
     positions: Sequence[Sequence[float] | None], axes: tuple[str, str] | None
 ) -> Float64[np.ndarray, "n 2"]:
-    """Return positions as rows of a table, NaN where there is none.
+    """Check positions, and return them as rows of a table, NaN where there is none.
 
     Raises:
-        ValueError, TypeError, OverflowError: axes that no map has, or a position that is not two
-            numbers in range.
+        ValueError, TypeError, OverflowError: unknown axes, or a position that is not a valid pair.
     """
     if axes is not None and axes not in AXES:
         raise ValueError(f"found axes {axes}, expected one of {AXES}")

@@ -36,9 +36,9 @@ class LiveAnswer(NamedTuple):
     """The answer to one frame."""
 
     answers: Answers
-    """The answers to this one query."""
+    """The answers to this frame, as those to a single query."""
     frame: Frame
-    """Its image, its time, and how many frames were passed over since the previous answer."""
+    """The frame: its image, its time, and how many were dropped since the previous answer."""
     latency_ms: float
     """Milliseconds from receiving the frame to the answer."""
 
@@ -90,17 +90,17 @@ def query_live(
         window: number of frames that are described together: each with those answered just before
             it. 1 describes each independently, like a map's images.
         min_similarity: see `query`.
-        sequence: see `query`; frames that were passed over are ignored.
+        sequence: see `query`; dropped frames are ignored.
         where: see `query`.
         verify: see `query`.
-        ready: called when the first frame can be answered.
+        ready: called once, when the first frame can be answered.
         check: called several times a second; it may raise to stop.
 
     Yields:
         The answer to each frame, with its latency.
 
     Raises:
-        InputError: parameters of another model, a number out of range, or what the source raises.
+        InputError: another model, a number out of range, or what `source.frames` raises.
 
     Example:
         >>> import jax, shutil
@@ -148,11 +148,11 @@ def query_live(
 
 
 def latency_words(milliseconds: Sequence[float], dropped: int) -> str:
-    """Summarise the latencies of answers, and how many frames were passed over, for a log.
+    """Summarise the latencies of answers, and how many frames were dropped, for a log.
 
     Args:
         milliseconds: the latency of each answer.
-        dropped: number of frames that were passed over.
+        dropped: number of frames that were dropped.
 
     Returns:
         The summary in one line.

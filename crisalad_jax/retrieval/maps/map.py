@@ -72,7 +72,7 @@ class Answer(NamedTuple):
     image: MapImage
     """The image: its name, and where it was taken."""
     probability: float | None = None
-    """Probability that the camera is there; None without a filter."""
+    """Probability that the camera is there; None without `sequence` in `query`."""
     verification: Verification | None = None
     """Result of matching local features; None if the answer was not verified."""
 
@@ -100,9 +100,9 @@ class Map:
         self.metadata = metadata
         """The contents of map.json."""
         self.images = Images()
-        """The images by number."""
+        """The images by number, as in the indices that `search` returns."""
         self.changed = ""
-        """When images were last removed, replaced or merged into it; empty for never."""
+        """Time (ISO 8601) of the last removal, replacement or merge of images; empty for never."""
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None if no image has a position."""
         self.zone: Zone | None = None
@@ -137,10 +137,10 @@ class Map:
 
         Args:
             folder: a folder that `index` made.
-            verify: whether to read and check all descriptors in files, as `verify` does; records
-                are always checked.
-            calibrated: whether to read the calibration; a map without it answers every query, even
-                if that file is damaged.
+            verify: whether to read and check all descriptors in files, as the method `verify` does;
+                records are always checked.
+            calibrated: whether to read the calibration. If not, the map answers every query, and a
+                damaged file does not matter.
 
         Returns:
             The map. It releases its store when it is closed, at the end of a `with`, or when
@@ -210,7 +210,7 @@ class Map:
         """Configuration of the model, with the image size and data type of the map's images.
 
         Raises:
-            InputError: it is not one that this package knows.
+            InputError: the recorded configuration is not one that this package knows.
         """
         return model_config(self.metadata, self.folder)
 
@@ -223,7 +223,7 @@ class Map:
         return False
 
     def refreshed(self) -> Self:
-        """Return the map as it is now: this one or, if it has changed, a new one in its place.
+        """Return this map or, if it has changed, close it and return a newly opened one.
 
         Raises:
             InputError: what `open` raises.
@@ -246,7 +246,7 @@ class Map:
         return additions_of(self.images)
 
     def was_removed(self, name: str, size: int | None = None) -> bool:
-        """Return whether an image with this name, and this size if given, was removed."""
+        """Return whether an image of this name (and size in bytes) was removed and is still out."""
         sizes = self.images.removed_names.get(name, ())
         is_one = bool(sizes) if size is None else size in sizes
         return is_one and self.images.find(name) is None
@@ -257,7 +257,7 @@ class Map:
         return None if number is None else self.images[number]
 
     def added(self, name: str) -> str | None:
-        """Return when the image with this name was described; None if its record does not say."""
+        """Return the ISO 8601 time when the image of this name was described; None if unknown."""
         return self.images.part_of(self._number(name)).added
 
     def _number(self, name: str) -> int:
@@ -298,7 +298,7 @@ class Map:
 
         Search is by inner product, or by equal bits in a map of bits; among equal similarities the
         earlier image comes first. An approximate search, if the map has one, finds nearly all of
-        the k most similar; their similarities are exact.
+        the k most similar, with exact similarities. Indices are those of `images`.
 
         Args:
             queries: unit descriptors of the map's model, shortened by its `components`. A map of
@@ -341,11 +341,11 @@ class Map:
 
     @property
     def stale_search(self) -> str | None:
-        """Kind of an approximate search not used, as it is for another set of images; or None."""
+        """Kind of an unused approximate search, built for another set of images; or None."""
         return stale_kind(self.folder, self._segments.spans) if self._approximate is None else None
 
     def shorten(self, descriptors: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n short"]:
-        """Shorten a model's descriptors by the map's `components`; a no-op without any."""
+        """Shorten a model's descriptors by the map's `components`, if it has any."""
         return descriptors if self.components is None else self.components.apply(descriptors)
 
     def build_search(self, kind: str, *, quiet: bool = True) -> float | None:
@@ -358,8 +358,8 @@ class Map:
             quiet: whether to hide the progress bar.
 
         Returns:
-            The recall of the 10 nearest images, measured on 100 images of the map; None for an
-            exact search.
+            Its recall: the share of exact neighbours that it finds, among the 10 nearest others to
+            each of 100 images of the map. None for an exact search.
 
         Raises:
             InputError: an unknown kind, one that Milvus lacks, or a map of bits.
@@ -387,8 +387,8 @@ class Map:
         `query` takes many images at once.
 
         Args:
-            image: 8-bit RGB, as `read_image` returns it, or grey (height, width) or (height,
-                width, 1), such as ROS's mono8; or its file.
+            image: a file; or 8-bit RGB, as `read_image` returns it, or grey (height, width) or
+                (height, width, 1), such as ROS's mono8.
             k: number of answers; all if the map has fewer.
             model: the model that made the map; None loads it from its recorded path.
             where: which images to search, as in `search`.
@@ -443,13 +443,13 @@ class Map:
         return convert(rows, name, self.metadata.descriptor_length)
 
     def positions_of(self, names: Iterable[str]) -> Positions | None:
-        """Return the positions of some images; None if none of them has one."""
+        """Return the positions of the images with these names; None if none of them has one."""
         images = map(self.image, names)
         of = {image.name: image.position for image in images if image and image.position}
         return Positions(self.axes, of, self.zone) if self.axes and of else None
 
     def descriptors_of(self, names: Iterable[str]) -> Queries:
-        """Read the descriptors of some images; for bits, unit vectors of the signs."""
+        """Read the descriptors of images by name; for bits, unit vectors of the signs."""
         numbers = np.fromiter(map(self._number, names), np.int64)
         found = self._segments[self.removed.rows_of(numbers)]
         return sign_vectors(found) if self.metadata.is_bits else found.astype(np.float32)
@@ -481,7 +481,7 @@ class Map:
         """Read all descriptors, and compare them with the digests in the records.
 
         Raises:
-            InputError: one has changed; the message says in which addition.
+            InputError: a descriptor has changed; the message says in which addition.
         """
         self._segments.verify()
 
@@ -489,14 +489,14 @@ class Map:
         """Summarise the map as JSON values by name.
 
         Args:
-            verify: whether to read all descriptors, as `verify` does.
+            verify: whether to read all descriptors, as the method `verify` does.
 
         Returns:
             Counts of images and positions, the map's folders, additions and extent, the model and
-            its settings, and where descriptors are.
+            its settings, and where descriptors are stored.
 
         Raises:
-            InputError: what `verify` raises.
+            InputError: what the method `verify` raises.
         """
         if verify:
             self.verify()
@@ -530,7 +530,7 @@ class Map:
         """Choose the engine that describes single images fastest, of those that agree with JAX.
 
         It is ONNX Runtime or OpenVINO if one is installed and computes the same as JAX, and JAX has
-        no accelerator. Weights are exported for it the first time.
+        no accelerator; otherwise "jax". Weights are exported for it the first time.
 
         Args:
             weights: as in `load_model`, which takes the result as `engine`.
@@ -563,7 +563,7 @@ class Map:
             The model, with the image size and data type of the map's images.
 
         Raises:
-            InputError: there is no such file, what `open_runtime` raises, or it is another model.
+            InputError: there is no such file, it is another model, or the engine cannot open it.
         """
         file = weights_of(self.metadata, self.folder) if weights is None else weights
         if engine == "jax":
@@ -588,12 +588,12 @@ class Map:
         """Return the describer of queries, which uses the model that made the map.
 
         Args:
-            model: the model; None uses the last one, or loads it. The map's image size and types
-                replace those of its configuration.
+            model: the model; None uses the last one, or else loads it. The map's image size and
+                types replace those of its configuration.
             groupings: groupings of the queries.
 
         Raises:
-            InputError: another model, or what `describer_of` raises.
+            InputError: another model, or one that does not support these groupings.
         """
         if model is None and self._describer is None:
             self.load_model(groupings=groupings)

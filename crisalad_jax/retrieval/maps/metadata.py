@@ -38,12 +38,12 @@ _PARTS = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MapMetadata:
-    """The contents of map.json; two that describe images in the same way are equal."""
+    """The contents of map.json; equal for maps that describe and store images in the same way."""
 
     model: str
-    """The `model_hash` of the weights that describe its images, and its queries."""
+    """The `model_hash` of the model that describes the map's images, and its queries."""
     weights: str = dataclasses.field(compare=False)
-    """Where those weights were: a path, or a name in `starter.FILES`."""
+    """Where the weights of that model were: a path, or a name in `starter.FILES`."""
     config: dict
     """The model's configuration as JSON values, with the image size and data type of the map's
     images."""
@@ -51,15 +51,15 @@ class MapMetadata:
     store: str = "files"
     """Where descriptors are stored; see `store.store_name`."""
     dtype: str = "float32"
-    """Type of the stored descriptors, of `store.DTYPES`."""
+    """Type of the stored descriptors, one of `store.DTYPES`."""
     grouping: str = "single"
-    """Every image is described independently, so that no descriptor depends on neighbours."""
+    """Always "single": no descriptor depends on other images."""
     collection: str = dataclasses.field(default="", compare=False)
     """Name of the Milvus collection of the descriptors."""
     created: str = dataclasses.field(default="", compare=False)
     pca: str = ""
-    """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
-    none."""
+    """The `pca_hash` of the components that shorten the descriptors of images and queries; "" if
+    there are none."""
     format: Literal[4] = 4
     """Version of the format."""
 
@@ -88,7 +88,7 @@ def model_config(metadata: MapMetadata, folder: str | os.PathLike[str]) -> "Mode
     """Return the configuration of the model that describes the images of a map.
 
     Raises:
-        InputError: it is not one that this package knows.
+        InputError: the recorded configuration is not one that this package knows.
     """
     from crisalad_jax.nn.config import ModelConfig
 
@@ -104,12 +104,12 @@ def new_metadata(
     dtype: str = "float32",
     pca: Pca | None = None,
 ) -> MapMetadata:
-    """Make the metadata of a new map in `folder`, whose images this model will describe.
+    """Make the metadata of a new map in `folder`, whose images `describer` will describe.
 
     Raises:
         InputError: the model's descriptors are not unit vectors, or the components don't produce
-            unit vectors or expect another length; bits of a length that is not a multiple of 8;
-            what `check_store` raises.
+            unit vectors or expect another length; bits of a length that is not a multiple of 8; or
+            an invalid store or type.
     """
     check_store(store, dtype)
     length, _ = shortened(pca, describer, str(weights), unit=dtype != "bits")
@@ -135,7 +135,7 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
 
     Raises:
         InputError: the folder holds something other than a map, or the map is damaged, of another
-            format, or contains a link.
+            format, or contains a symbolic link.
     """
     folder = pathlib.Path(folder)
     path = folder / METADATA
@@ -161,7 +161,7 @@ def existing_metadata(folder: str | os.PathLike[str]) -> MapMetadata:
     """Read the metadata of the map in `folder`.
 
     Raises:
-        InputError: there is none, or what `read_metadata` raises.
+        InputError: there is no map, or what `read_metadata` raises.
     """
     metadata = read_metadata(folder)
     if metadata is None:
@@ -172,7 +172,7 @@ def existing_metadata(folder: str | os.PathLike[str]) -> MapMetadata:
 
 
 def read_components(folder: pathlib.Path, metadata: MapMetadata) -> Pca | None:
-    """Read the components of a map; None if it has none.
+    """Read the components that shorten the descriptors of a map; None if it has none.
 
     Raises:
         InputError: the file is gone, damaged, or of other components.
@@ -199,9 +199,9 @@ def check_model(
     weights: object,
     quantised_from: str | None = None,
 ) -> None:
-    """Check that a map was made by the model with the hash `digest`.
+    """Check that a map was made by the model with the hash `digest`, called `weights` in messages.
 
-    A warning says if it is an int8 program, quantised from the model that made the map.
+    An int8 program that was quantised from the map's model is accepted with a warning.
 
     Raises:
         InputError: the hashes differ; the message has both.
@@ -225,7 +225,7 @@ def weights_of(metadata: MapMetadata, folder: str | os.PathLike[str]) -> pathlib
     """Return the file of the weights that made a map.
 
     Raises:
-        InputError: it is no longer where it was.
+        InputError: the file is no longer where it was.
     """
     file = resolved(metadata.weights)
     if not file.exists():

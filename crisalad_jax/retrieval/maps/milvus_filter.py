@@ -25,7 +25,7 @@ _NOWHERE = sys.float_info.max
 
 
 def columns_of(record: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """Return the scalar fields of a record's images, which conditions refer to."""
+    """Return the scalar fields of a record's images, by name; search conditions refer to them."""
     names = record["names"]
     added = record.get("added")
     moments = [moment_of(name) for name in names]
@@ -47,7 +47,7 @@ def _encoded(name: str) -> str:
 
 
 def condition_of(where: Where) -> list[str]:
-    """Return the parts of Milvus' filter for conditions on images as they were added."""
+    """Return the terms of Milvus' filter for conditions on images as they were added."""
     parts = []
     if where.folder.rstrip("*"):
         begins = map(_encoded, where.prefixes)

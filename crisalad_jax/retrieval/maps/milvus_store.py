@@ -73,14 +73,14 @@ KINDS = {
     ),
     "diskann": _Kind("DISKANN", (2, 2), {}, lambda k: {"search_list": max(128, 2 * k)}),
 }
-"""How Milvus searches: by comparing all, in memory; by a graph, in memory; by codes of a bit and a
-byte per dimension, in memory; by a graph on disk. HNSW has the parameters of maps in files."""
+"""How Milvus searches: all descriptors ("exact"), a graph set up as for files ("hnsw") or codes of
+a bit and a byte per dimension ("ivf-rabitq"), in memory; or a graph on disk ("diskann")."""
 _FEW, _GRAPH_BYTES = 50_000, 2**34
 """Maximum number of descriptors compared one by one, and maximum bytes of those in a graph."""
 
 
 def choose_kind(count: int, length: int, version: tuple[int, ...]) -> str:
-    """Choose an index of this Milvus version for `count` descriptors of this length."""
+    """Choose one of `KINDS` in this Milvus version, for `count` descriptors of this length."""
     kinds = [kind for kind in ("ivf-rabitq", "diskann") if KINDS[kind].since <= version]
     small = "exact" if count <= _FEW else "hnsw"
     return small if 4 * count * length <= _GRAPH_BYTES or not kinds else kinds[0]
@@ -140,7 +140,7 @@ class MilvusStore:
         numbers = re.findall(r"\d+", self._server)[:3]
         self._version = (0,) if self._is_file else tuple(map(int, numbers))
         self.kind = "exact"
-        """One of `KINDS`."""
+        """The kind of the current index, one of `KINDS`."""
         if new:
             self._ask("removing what a kill left", "drop_collection")
             self._create()
@@ -343,7 +343,7 @@ class MilvusStore:
     ) -> Neighbours:
         """Find the k most similar descriptors for each query; see `FileStore.search`.
 
-        Milvus searches its FLAT index; with other indices, all descriptors are read and compared.
+        Milvus itself searches for kind "exact"; with others, all descriptors are read and compared.
         """
         require(k <= _MOST, f"k: found {k}, expected at most {_MOST}, the limit of Milvus")
         if self.kind != "exact":
@@ -408,7 +408,7 @@ def break_ties(
         ask: takes queries and k; returns the k most similar of each, equal ones in any order.
         queries: unit descriptors.
         k: neighbours per query, at most `count`.
-        count: number of descriptors.
+        count: number of descriptors that can be found.
     """
     asked = k + 1
     while True:

@@ -20,7 +20,7 @@ SIMILAR = "similar"
 
 
 class Novelty:
-    """Chooses which images of a source a map takes, in order, as they are described."""
+    """Choice of the images that a map takes from a source, in order, as they are described."""
 
     def __init__(self, target: AppendableMap, source: ImageSource, root: str, most: float) -> None:
         """Read which images were left out before.
@@ -72,7 +72,7 @@ class Novelty:
         return True
 
     def leave_out(self, names: Sequence[str], sizes: Sequence[int]) -> None:
-        """Record images that were left out, with their sizes in bytes."""
+        """Record that images were left out, with the sizes of their files in bytes."""
         path = self._folder / f"{len(self._records):010d}.json"
         write_record(path, {**self._settings, "names": list(names), "bytes": list(sizes)})
         self._records.append(path)

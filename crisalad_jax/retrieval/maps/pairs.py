@@ -1,4 +1,4 @@
-"""Pairs of images to match, as COLMAP and hloc read them: similar ones, neighbours, loops."""
+"""Pairs of images to match, for COLMAP and hloc: similar, consecutive or nearby ones, and loops."""
 
 import collections
 import itertools
@@ -40,7 +40,7 @@ class ImagePairs(NamedTuple):
     """Pairs of images to match."""
 
     pairs: list[_Pair]
-    """Names of two images; among the images of one map a pair is listed once, in either order."""
+    """Names of two images; among the images of one map, each pair is listed once, in any order."""
     root: pathlib.Path
     """Folder that names are relative to: COLMAP's image_path."""
     unreadable: list[str]
@@ -81,13 +81,13 @@ def image_pairs(
     """Choose pairs of images to match, by at least one of the rules below.
 
     Pairs are among the images of a map, for reconstruction, or between other images and those of
-    the map, to localise them. An image is never paired with itself.
+    the map, to localise the others. An image is never paired with itself.
 
     Args:
         places: the map, open.
         images: a source of other images (docs/how-to/image-sources.md), which the map's model
             describes; None pairs the map's images with each other.
-        model: that model; None loads it from its recorded path (`Map.load_model`).
+        model: the map's model; None loads it from its recorded path (`Map.load_model`).
         k: pair each image with its k most similar ones; 0 turns this rule off.
         min_similarity: minimum similarity for rule `k`.
         min_gap: minimum seconds between images for rule `k`, by the times in their names (to find
@@ -100,12 +100,12 @@ def image_pairs(
         reading: how `images` are read.
 
     Returns:
-        The pairs: by `overlap`, then `within`, then `k`, with each image's best first.
+        The pairs of rule `overlap`, then `within`, then `k`, with each image's most similar first.
 
     Raises:
-        InputError: a number out of range; no rule; `overlap` or `within` with `images`; `within`
-            in a map without positions; `min_gap` without `k` or times in names; a name with
-            spaces or leading #; or what `Map.search` and reading the images raise.
+        InputError: a number out of range; no rule; `overlap` or `within` with `images`; `within` in
+            a map without positions; `min_gap` without `k` or times in names; a name with spaces or
+            leading #; images that cannot be read; or what `Map.search` raises.
 
     Example:
         >>> import jax

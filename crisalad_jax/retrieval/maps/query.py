@@ -42,7 +42,7 @@ if TYPE_CHECKING:  # answers are searched without JAX
     from crisalad_jax.nn.model import Model
 
 Thresholds = tuple[float | None, int | None]
-"""Minimum similarity and number of inliers of a best answer; None accepts any."""
+"""Minimum similarity, and minimum inliers, of a best answer; None accepts any."""
 AT_ONCE = 1024
 """Number of queries that are searched for together: the map is read once for all of them."""
 
@@ -64,10 +64,10 @@ class Answers(NamedTuple):
     min_similarity: float | None = None
     """Minimum similarity of a best answer; None accepts any."""
     probabilities: Float64[np.ndarray, "query k"] | None = None
-    """Probability that the camera is at each answer; None without a filter."""
+    """Probability that the camera is at each answer; None without `sequence`."""
     best: Float32[np.ndarray, " query"] | None = None
-    """Similarity of the map's most similar image, which a filter may not have ranked first; None
-    without a filter, as it is the first answer's."""
+    """Similarity of the map's most similar image, if `sequence` or `verify` may have ranked another
+    first; None if it is the first answer's."""
     zone: Zone | None = None
     """UTM zone of all positions; None if unknown."""
     root: pathlib.Path | None = None
@@ -77,7 +77,7 @@ class Answers(NamedTuple):
     """Verifications of the first answers to each query, in the order of `neighbours`; None if
     answers were not verified."""
     poses: Sequence[MapPose | None] | None = None
-    """Camera pose of each query, if verified answers determine it; None as for `checks`."""
+    """Camera pose of each query, if verified answers determine it; None without `verify`."""
     min_inliers: int | None = None
     """Minimum number of inliers of a verified best answer; None accepts any."""
 
@@ -88,7 +88,7 @@ class Answers(NamedTuple):
 
     @property
     def names(self) -> list[str]:
-        """Name of each query, a posix path below `root`."""
+        """Name of each query: a posix path below `root`, or the full path if `root` is None."""
         root = self.root
         named = self.queries if root is None else [path.relative_to(root) for path in self.queries]
         return [path.as_posix() for path in named]
@@ -97,7 +97,7 @@ class Answers(NamedTuple):
     def known(self) -> Bool[np.ndarray, " query"]:
         """Whether each query shows a place of the map.
 
-        The most similar image is similar enough, and a verified best answer has enough inliers.
+        True if an image is similar enough and the best answer, if verified, has enough inliers.
         """
         best = self.neighbours.similarities[:, 0] if self.best is None else self.best
         least = -np.inf if self.min_similarity is None else self.min_similarity
@@ -141,11 +141,11 @@ def query(
 
     Args:
         places: the map, open.
-        images: an image file, a folder, another source of images
-            (docs/how-to/image-sources.md), or a list of these.
+        images: an image file, a folder, another source of images (docs/how-to/image-sources.md), or
+            a list of these.
         model: the model that made the map; None loads it from its recorded path (`Map.load_model`).
         k: number of answers per query.
-        fps: frames per second, if `images` is a video or log; None is 1.
+        fps: frames per second to take from a video or robot log; None is 1.
         topic: the image topic of a robot log; None takes the only one.
         window: number of frames that are described together: each with those just before it in its
             source, as a moving camera sees them. Files listed one after the other are one source. 1
@@ -165,8 +165,8 @@ def query(
         The answers, which remain usable after the map is closed.
 
     Raises:
-        InputError: another model; no image, an unreadable one under "stop", or only such; a number
-            out of range; or what `Map.search` and `Verifier.check` raise.
+        InputError: another model; no image, an unreadable one under "stop", or none readable; a
+            number out of range; answers that cannot be verified; or what `Map.search` raises.
 
     Example:
         >>> import jax
@@ -221,7 +221,7 @@ def _read_each(paths: Sequence[pathlib.Path], bar: Bar) -> Iterator[np.ndarray]:
 
 
 Ask = Callable[[Float32[np.ndarray, "query d"], Sequence[pathlib.Path]], Neighbours | TrackResult]
-"""Finds the answers to images from their descriptors and names."""
+"""A function that finds the answers to images from their descriptors and paths."""
 
 
 def asking(
@@ -233,12 +233,12 @@ def asking(
     *,
     exact: bool = False,
 ) -> Ask:
-    """Return a function that finds k answers: by the map's search, or by a filter over frames.
+    """Return a function that finds k answers: by the map's search, or by `sequence` if given.
 
-    If more than k are to be verified, it finds that many, of which `verified` returns k.
+    If more than k answers are to be verified, it finds that many, of which `verified` returns k.
 
     Raises:
-        InputError: conditions that no image meets, or with a filter, which needs all images.
+        InputError: `where` has conditions that no image meets, or is combined with `sequence`.
     """
     if verifier is not None:
         k = max(k, verifier.verify.answers)
@@ -314,7 +314,7 @@ def asked_thresholds(
         verifier: the verifier of answers, which may set the inliers; None verifies none.
 
     Raises:
-        InputError: the similarity is not a cosine; what `calibration_of` raises.
+        InputError: the similarity is not a cosine; the calibration is damaged or of another model.
     """
     inliers = None if verifier is None else verifier.verify.min_inliers
     measured = calibration_of(places, verifier) if None in (min_similarity, inliers) else None
@@ -360,7 +360,7 @@ def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, 
 
 
 def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any]:
-    """Return an answer's rank, name, similarity and position as JSON values."""
+    """Return an answer's rank, name, similarity, position and any other results as JSON values."""
     fields: dict[str, Any] = {
         "rank": answer.rank,
         "name": answer.image.name,
@@ -378,9 +378,9 @@ def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
     Names of queries are relative to their source, like those of a map's images. Frames of videos
-    also have a `time` in seconds, and UTM metres their `zone`. If answers must have a minimum
-    similarity, the line says whether the query is of a `known` place; the answers of an unknown one
-    are still listed. Unprintable characters in a name, or bytes that are not UTF-8, are escaped.
+    also have a `time` in seconds, and UTM metres their `zone`. If answers must meet a threshold,
+    the line says whether the query is of a `known` place; the answers of an unknown one are still
+    listed. Unprintable characters in a name, or bytes that are not UTF-8, are escaped.
     """
     return map(json_text, json_rows(answers))
 

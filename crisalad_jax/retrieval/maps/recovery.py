@@ -13,7 +13,7 @@ def remove_unrecorded(folder: pathlib.Path, images: int) -> None:
     """Remove the files of descriptors that have no record, with a warning.
 
     A kill leaves at most one addition without a record. A map gets its calibration, and its
-    approximate search, only once it has images.
+    approximate search, only once it has images: if they exist without images, a record was lost.
 
     Args:
         folder: the map's folder, whose lock is held.

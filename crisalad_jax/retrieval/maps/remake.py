@@ -1,4 +1,4 @@
-"""Rebuild a map with another model, and exchange it with the old one when it is complete."""
+"""Rebuild a map with another model, and replace the old map once the new one is complete."""
 
 import dataclasses
 import os
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 
 
 def source_of_map(places: Map) -> ImageSource:
-    """Find the files of a map's images, where they were indexed.
+    """Find the image files of a map in the folders from which they were indexed.
 
     Args:
-        places: the map.
+        places: the open map.
 
     Returns:
-        The images, and where they were taken.
+        The files, their names, and the positions where the images were taken.
 
     Raises:
-        InputError: a file is gone or has another size; or one of several folders is remote.
+        InputError: a file is missing or has another size; or one of several folders is remote.
     """
     check_images(places)
     roots: dict[str, list[str]] = {}
@@ -64,10 +64,10 @@ def source_of_map(places: Map) -> ImageSource:
 
 
 def check_images(places: Map) -> None:
-    """Check that a map's images are where they were indexed.
+    """Check that a map's image files are still in the folders from which they were indexed.
 
     Raises:
-        InputError: one is gone, or has another size.
+        InputError: a file is missing, or its size differs from the one that the map records.
     """
     paths = [pathlib.Path(image.root) / image.name for image in places.images]
     for path, size, image in zip(paths, for_each(size_of, paths), places.images, strict=True):
@@ -83,8 +83,8 @@ def check_remakeable(folder: str | os.PathLike[str]) -> MapMetadata:
     """Check that `remake_map` can rebuild the map in a folder, and return its metadata.
 
     Raises:
-        InputError: its descriptors are in Milvus, components shorten them, or the folder holds
-            other files too, such as pictures sent to a service, which would be lost.
+        InputError: there is no map; its descriptors are in Milvus or reduced by PCA; or the folder
+            also holds files that would be lost, such as pictures sent to `serve_map`.
     """
     folder, metadata = pathlib.Path(folder), existing_metadata(folder)
     advice = "`crisalad index` makes another map"
@@ -116,22 +116,22 @@ def remake_map(
 ) -> int:
     """Rebuild a map by describing its images with another model.
 
-    The new map replaces the old one in a single step when it is complete, so a killed call leaves
-    one of the two. The new one has the same positions, folders, dates and kind of search, but no
-    calibration or record of removed images. A running service continues with the old map.
+    The complete new map replaces the old one in a single step, so a call that is killed leaves one
+    of the two. Positions, folders, dates and the kind of search are preserved, not the calibration
+    and the record of removed images. Restart a running service, as it does not load the new map.
 
     Args:
         folder: the map's folder.
-        model: the model that describes the images.
-        weights: the model's file, which queries load by default.
-        reading: how images are read; each must be readable.
+        model: the model that describes the images from now on.
+        weights: file of the model's weights, which later queries load by default.
+        reading: how images are read; an unreadable image is always an error.
 
     Returns:
         The number of images.
 
     Raises:
-        InputError: an image is gone, changed or cannot be read; another process writes into the
-            map; the file system cannot exchange two folders; what `check_remakeable` raises.
+        InputError: an image file is missing, changed or unreadable; another process writes into the
+            map; the file system cannot swap two folders; or `check_remakeable` refuses the map.
 
     Example:
         >>> import jax

@@ -1,4 +1,4 @@
-"""Rows of a store that were removed from its map, and the numbers of those that are left."""
+"""The rows of a store that were removed from its map, and how the remaining rows are numbered."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,13 +11,13 @@ if TYPE_CHECKING:
 
 
 class Removed(NamedTuple):
-    """Rows that do not count; the others are numbered from 0 in order."""
+    """The removed rows of a store; the remaining rows are numbered from 0, in order."""
 
     rows: Int64[np.ndarray, " removed"] = np.empty(0, np.int64)
-    """In ascending order."""
+    """Indices of the removed rows in the store, in ascending order."""
     asked: "tuple[Where, Int64[np.ndarray, ' removed']] | None" = None
-    """The same selection for Milvus: conditions on images as they were added, and the rows that
-    were also removed. None if it has no such form."""
+    """The same rows as a filter for Milvus: conditions that images must meet as first added, and
+    rows to exclude in addition. None if the rows cannot be expressed like that."""
 
     def has(self, row: int) -> bool:
         """Return whether a row was removed."""
@@ -25,16 +25,16 @@ class Removed(NamedTuple):
         return place < len(self.rows) and self.rows[place] == row
 
     def numbers_of(self, rows: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-        """Return the number of each row that is left."""
+        """Convert remaining rows of the store to their numbers, which skip removed rows."""
         return rows - np.searchsorted(self.rows, rows)
 
     def rows_of(self, numbers: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-        """Return the row of each number."""
+        """Convert the numbers of remaining rows back to rows of the store."""
         left_before = self.rows - np.arange(len(self.rows))
         return numbers + np.searchsorted(left_before, numbers, side="right")
 
     def left(self, first: int, count: int) -> Int64[np.ndarray, " left"] | None:
-        """Return which of `count` rows from `first` on remain, by place; None if all do."""
+        """Return which of the `count` rows from `first` on remain, as offsets; None if all do."""
         start, end = np.searchsorted(self.rows, [first, first + count])
         gone = self.rows[start:end] - first
         return np.delete(np.arange(count), gone) if gone.size else None

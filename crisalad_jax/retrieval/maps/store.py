@@ -1,8 +1,8 @@
 """Stores of a map's descriptors: files or Milvus, behind one interface.
 
-A store knows descriptors by number, from 0, and nothing about images. The map says how many of them
-count. Descriptors beyond these, left by a killed addition, are never returned, and the next
-addition overwrites them.
+A store holds descriptors by index, from 0, and knows nothing about images. The map records how many
+descriptors are valid. Descriptors beyond that number, left by an addition that was killed, are
+never returned, and the next addition overwrites them.
 """
 
 import pathlib
@@ -17,19 +17,20 @@ if TYPE_CHECKING:
     from crisalad_jax.retrieval.maps.metadata import MapMetadata
 
 DTYPES = ("float32", "float16", "bits")
-"""Types that descriptors may be stored as; bits are their signs (`retrieval.bits`)."""
+"""Types in which descriptors may be stored; bits are the signs of all dimensions (`pack_bits`)."""
 _MILVUS = "milvus:"
 
 
 Store = FileStore | MilvusStore
-"""Descriptors by number. Each method raises InputError if the store is damaged or gone."""
+"""A map's stored descriptors. Methods raise InputError if the store is damaged or missing."""
 
 
 def check_store(name: str, dtype: str) -> None:
-    """Check the name of a store, and that it can hold descriptors of a type.
+    """Check the name of a store, and that the store can hold descriptors of type `dtype`.
 
     Raises:
-        InputError: neither "files" nor "milvus:URI", or a URI or type that Milvus does not take.
+        InputError: the name is neither "files" nor "milvus:URI", the URI is neither a file name.db
+            nor an http address, or the type is not in `DTYPES` or, in Milvus, not float32.
     """
     if name != "files":
         require(name.startswith(_MILVUS), f"store: found {name!r}, expected files or milvus:URI")
@@ -39,10 +40,9 @@ def check_store(name: str, dtype: str) -> None:
 
 
 def store_name(name: str, folder: pathlib.Path) -> str:
-    """Return the name that a map in `folder` records for a store from the command line.
+    """Convert the name of a store to the one that the map in `folder` records.
 
-    It contains the absolute path of a Milvus file, or the path relative to the map's folder if the
-    file is inside.
+    The path of a Milvus file becomes absolute, or relative to `folder` if the file is inside it.
     """
     address = name.removeprefix(_MILVUS)
     if name == "files" or check_address(address):
@@ -57,10 +57,10 @@ def open_store(metadata: "MapMetadata", folder: pathlib.Path, *, new: bool) -> S
     Args:
         metadata: the map's metadata.
         folder: the map's folder.
-        new: whether to create the store, in place of one that a kill left unfinished.
+        new: whether to create the store, replacing one that a killed process left unfinished.
 
     Raises:
-        InputError: it cannot be reached, is missing, or holds something else.
+        InputError: the store cannot be reached, is missing, or does not belong to this map.
     """
     if metadata.store == "files":
         return FileStore(folder / "segments", *metadata.row)

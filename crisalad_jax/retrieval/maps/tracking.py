@@ -1,4 +1,4 @@
-"""Locate consecutive frames of one camera in a map, by a search over its images in order."""
+"""Locate a camera in a map from its consecutive frames and the order of the map's images."""
 
 import itertools
 import math
@@ -19,7 +19,7 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, Float64, Int64
 
 SequenceSearch = BayesFilter | SeqSlam
-"""Locates a camera by its frames so far."""
+"""A method that locates a camera from all of its frames so far."""
 _NUMBERS = 2**25
 """Similarities computed at a time: 128 MiB."""
 _GAP = 1e9
@@ -31,21 +31,21 @@ _Spot = tuple[str, tuple[float, ...]]
 
 @brief
 class TrackResult(NamedTuple):
-    """Images of a map for each of some frames, the most probable first."""
+    """The k most probable images of a map for each frame, by number, the most probable first."""
 
     numbers: Int64[np.ndarray, "frame k"]
     similarities: Float32[np.ndarray, "frame k"]
     probabilities: Float64[np.ndarray, "frame k"]
-    """Probability that the camera is at each image."""
+    """Probability that the camera is at each image, given all frames up to this one."""
     best: Float32[np.ndarray, " frame"]
-    """Similarity of the image in the entire map that is most similar to the frame."""
+    """Largest similarity of each frame to any image of the map, however improbable."""
 
 
 class SequenceTracker:
     """Tracks a camera through a map, a few frames at a time."""
 
     def __init__(self, places: Map, search: SequenceSearch) -> None:
-        """Start a sequence in a map, whose descriptors are read twice."""
+        """Start a sequence anywhere in a map; all of its descriptors are read twice."""
         self._map = places
         self._filter: Any = search
         total = sum(part.sum(axis=0, dtype=np.float64) for part in places.descriptors)
@@ -60,20 +60,20 @@ class SequenceTracker:
     ) -> "TrackResult":
         """Update the camera's state with the next frames, and rank the map's images for each.
 
-        Motion is in metres if the map has a position for every image and the names of the first
-        frames contain @UTM positions; else in seconds if names on both sides contain times; else in
-        images of the map per frame, with a warning.
+        The first call decides how motion is measured: in metres if all images of the map have
+        positions and the names of its frames contain @UTM positions; else in seconds if all names
+        contain times; else in images of the map per frame, with a warning. `SeqSlam` counts images.
 
         Args:
-            descriptors: unit descriptors of the frames in order, of the map's model.
-            k: images per frame; all if there are fewer.
-            frames: their names.
+            descriptors: unit descriptors of the frames, in order, by the map's model.
+            k: number of images per frame; all if the map has fewer.
+            frames: names of the frames.
 
         Returns:
-            The images that the camera is most probably at, best first.
+            For each frame, the images that the camera is most probably at, best first.
 
         Raises:
-            InputError: what `Map.similarities` raises.
+            InputError: the descriptors do not fit the map, or its store is damaged or missing.
         """
         if self.state.frames == 0 and not self._filter.counts_images:
             self._choose_unit(frames)

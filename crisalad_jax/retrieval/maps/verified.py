@@ -1,4 +1,4 @@
-"""Verify the answers of a map: rank them by inliers, and compute the camera's pose."""
+"""Verify a map's answers to a query by local features: reorder them, and locate the camera."""
 
 from collections.abc import Sequence
 
@@ -22,21 +22,21 @@ def verify_answers(
     similarities: Float32[np.ndarray, " n"],
     axes: tuple[str, str] | None,
 ) -> tuple[Int64[np.ndarray, " n"], list[Verification], MapPose | None]:
-    """Verify answers to a query, rank them, and compute where its camera was.
+    """Verify the answers to a query, reorder them, and locate the query's camera.
 
     Args:
-        verifier: the verifier.
-        image: the query.
+        verifier: the verifier, which matches local features.
+        image: pixels of the query, of any type that `Verifier.check` takes.
         found: the answers, best first.
-        similarities: similarities of the answers.
-        axes: axes of their positions; None if there are none.
+        similarities: similarities of the answers to the query.
+        axes: axes of the answers' positions (`positions.AXES`); None if there are none.
 
     Returns:
-        The answers' numbers in the order of `order_by_inliers`; their verifications in that order;
-        and where the query's camera was, or None if no two answers determine it.
+        Indices into `found` in the order of `order_by_inliers`; the verifications in that order;
+        and the pose of the query's camera on the map, or None if no two answers determine it.
 
     Raises:
-        InputError: what `Verifier.check` raises.
+        InputError: what `Verifier.check` raises, such as if no answer's image can be read.
     """
     names = [(each.root, each.name) for each in found]
     checks = verifier.check(image, names)
@@ -67,12 +67,12 @@ def _metres(position: tuple[float, float], zone: Zone | None) -> Float64[np.ndar
 
 
 def calibration_of(places: Map, verifier: Verifier | None) -> Calibration | None:
-    """Return a map's calibration of verified answers or, without one, of similarities.
+    """Return a map's calibration for verified answers or, without one, that for similarities.
 
-    A calibration by another matcher is not used, and a warning says so.
+    A calibration made with another matcher than the verifier's is ignored, with a warning.
 
     Raises:
-        InputError: the file is damaged, or of another model.
+        InputError: the calibration file is damaged, or belongs to another model than the map's.
     """
     found = verifier and read_calibration(places.folder, places.metadata.model, VERIFIED)
     if verifier and found and found.verifier != verifier.name:

@@ -1,4 +1,4 @@
-"""Conditions on the images of a map that are searched: their folder, times and positions."""
+"""Conditions on a map's images, to search only some: by folder, time and position."""
 
 import dataclasses
 import datetime
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from crisalad_jax.retrieval.maps.images import Images
 
 Interval = tuple[float, float]
-"""Seconds since 1970, including the first and excluding the last."""
+"""Start (included) and end (excluded) in seconds since 1970, UTC."""
 ALWAYS: Interval = (-math.inf, math.inf)
 _KEYS = "folder=, added>=, time>= (or >, <, <=, =) or box="
 _CONDITION = re.compile(r"((?:folder|box)\s*(?==)|added|time)\s*([<>]=?|=)\s*(.+)", re.S)
@@ -30,7 +30,7 @@ _DAY = 86400.0
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class Where:
-    """Conditions on images of a map; images that meet all of them are searched.
+    """Conditions on the images of a map; only images that meet all of them are searched.
 
     Example:
         >>> Where.parse("folder=monday, added>=2026-05-01, box=11.5,48.1,11.6,48.2")
@@ -38,10 +38,10 @@ class Where:
     """
 
     folder: str = ""
-    """What contains the image, at any depth: a folder, a video, or a log with its topic. With * at
-    the end, a prefix of the image's name. An empty string matches all images."""
+    """What contains the image, at any depth: a folder, a video, a log, or a log's topic as in
+    walk.bag#/camera. With * at the end, a prefix of the image's name. Empty matches all images."""
     added: Interval = ALWAYS
-    """When the image was added to the map, as its record says."""
+    """When the image was added to the map. Images without a recorded time meet only the default."""
     time: Interval = ALWAYS
     """When the image was taken, if its name says so in seconds since 1970, as names of log frames
     do. Images without such a time meet only the default."""
@@ -51,17 +51,17 @@ class Where:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse conditions separated by commas.
+        """Parse conditions that are separated by commas.
 
-        A date is the whole day, a time the whole second: `added<=2026-05-01` includes what was
-        added on that day. Times without a zone are UTC.
+        A date is the whole day, a time the whole second: `added<=2026-05-01` includes images that
+        were added on that day. Times without a zone are UTC.
 
         Args:
             text: such as "folder=monday, added>=2026-05-01, time<2026-05-01T12:00,
-                box=11.5,48.1,11.6,48.2", any of which may be omitted; times may have two bounds.
+                box=11.5,48.1,11.6,48.2". Each key is optional; a time may have two bounds.
 
         Raises:
-            InputError: another key, a missing or second value, or one that is not a time or a box.
+            InputError: an unknown key, a repeated folder or box, or a value that does not parse.
         """
         found: dict[str, Any] = {}
         for part in re.split(r",(?=\s*\w+\s*[<>=])", text):
@@ -79,22 +79,22 @@ class Where:
 
     @property
     def prefixes(self) -> tuple[str, ...]:
-        """Prefixes of names that match; a frame's name has # after its video, log or topic."""
+        """Prefixes of matching names; in a frame's name, # follows the video, log or topic."""
         if self.folder.endswith("*"):
             return (self.folder.removesuffix("*"),)
         folder = self.folder.rstrip("/")
         return f"{folder}/", f"{folder}#"
 
     def left_out(self, images: "Images", axes: tuple[str, str] | None) -> Removed:
-        """Find the rows to leave out: of images that do not meet all conditions, or were removed.
+        """Find the rows that a search skips: of removed images, and of those that fail a condition.
 
         Args:
             images: the map's images.
-            axes: axes of their positions; None if they have none.
+            axes: axes of the images' positions (`positions.AXES`); None without positions.
 
         Raises:
-            InputError: no image is left; a box without positions, or one in metres whose west is
-                larger than its east.
+            InputError: no image is left; a box, but the map has no positions; or a box in metres
+                whose west is larger than its east.
         """
         masks: dict[str, Bool[np.ndarray, " row"]] = {}
         if self.folder:

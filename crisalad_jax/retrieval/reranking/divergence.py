@@ -1,4 +1,4 @@
-"""The Sinkhorn divergence between the local tokens of two images, as a second stage."""
+"""A second stage that scores two images by the Sinkhorn divergence of their local tokens."""
 
 import functools
 
@@ -17,7 +17,7 @@ def shape(config: ModelConfig) -> tuple[int, int]:
     """Return the number of local tokens of an image, and their width.
 
     Raises:
-        InputError: there are none.
+        InputError: the aggregator of the model has no local tokens.
     """
     _, tokens, dim = config.token_shape
     require(
@@ -32,7 +32,7 @@ def shape(config: ModelConfig) -> tuple[int, int]:
 def describe(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image token dim"]:
-    """Compute the unit local tokens of every image independently, in float16."""
+    """Compute the local tokens of every image independently, as unit vectors in float16."""
     return l2_normalise(extract_tokens(params, images, config).local).astype(jnp.float16)
 
 
@@ -42,6 +42,6 @@ def scores(
     candidates: Float[AnyArray, "candidate token dim"],
     config: ModelConfig,
 ) -> Float[Array, " candidate"]:
-    """Compute the negative divergence of each candidate (Feydy et al., AISTATS 2019)."""
+    """Compute each candidate's negative divergence from the query (Feydy et al., AISTATS 2019)."""
     ours = jnp.broadcast_to(query, candidates.shape)
     return -sinkhorn_divergence(ours, jnp.asarray(candidates))

@@ -1,6 +1,6 @@
-"""FoL's second stage: local features around the patches with most mass (Wang et al., AAAI 2025).
+"""FoL's second stage: local features of the patches with most mass (Wang et al., AAAI 2025).
 
-The paper's equations, with the constants of the public model.
+It follows the paper's equations, with the constants of the public model.
 """
 
 import functools
@@ -26,14 +26,14 @@ _OUTLIERS, _USUAL = 3, 0.05
 """Number of largest masses that are replaced, and the share of patches above the one whose mass
 replaces them."""
 LEAST_COSINE = 0.7
-"""Cosine above which features match."""
+"""Features match only if their cosine is above this value."""
 
 
 def shape(config: ModelConfig) -> tuple[int, int]:
     """Return the maximum number of local features of an image, and their width.
 
     Raises:
-        InputError: the images have too few patches.
+        InputError: the images have fewer than 225 patches, or fewer than 19 rows of them.
     """
     assert isinstance(config.aggregator, FolConfig)
     height, width = config.input_size
@@ -48,9 +48,9 @@ def shape(config: ModelConfig) -> tuple[int, int]:
 
 
 def confidence(plan: Float[Array, "patch column"]) -> Float[Array, " patch"]:
-    """Compute the mean mass that a patch sends to a cluster, without the largest outliers.
+    """Compute the mean mass that each patch sends to a cluster, with the largest outliers reduced.
 
-    The largest three are set to the value that one in twenty of the patches exceeds.
+    The three largest means are replaced by the value that 5 % of the patches exceed.
 
     Args:
         plan: the mass that each patch sends to each cluster, and in the last column to the dustbin.
@@ -63,7 +63,7 @@ def confidence(plan: Float[Array, "patch column"]) -> Float[Array, " patch"]:
 def chosen_features(
     confidences: Float[Array, " patch"], local: Float[Array, "rows columns local"]
 ) -> Float[Array, "feature local"]:
-    """Return the local features of the most confident patches in row order, padded with zeros."""
+    """Return the local features in the most confident patches, in row order, padded with zeros."""
     rows, columns, _ = local.shape
     size = [(side - 1) // SCALE**2 + 1 for side in (rows, columns)]
     first = jax.lax.top_k(confidences, CHOSEN)[1]
@@ -96,7 +96,7 @@ def describe(
 def count_matches(
     query: matching.Features, candidates: matching.Features, config: ModelConfig
 ) -> matching.Scores:
-    """Count the mutual matches with a cosine above `LEAST_COSINE`; a single one counts as none."""
+    """Count each candidate's mutual matches above `LEAST_COSINE`; a single match counts as none."""
     matches = np.asarray(matching.match_all(query, candidates, LEAST_COSINE))
     counts = (matches >= 0).sum(axis=1)
     return np.where(counts == 1, 0, counts).astype(np.float32)

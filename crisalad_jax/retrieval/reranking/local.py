@@ -12,9 +12,9 @@ from crisalad_jax.retrieval.verification.verify import Verifier, order_by_inlier
 
 
 class LocalReranker(SecondStage):
-    """Re-ranks the first neighbours of each query by similarity and inliers.
+    """Re-ranks the first neighbours of each query by similarity and inliers together.
 
-    In the result, numbers of inliers take the place of similarities.
+    In the result, the number of inliers replaces the similarity of each re-ranked neighbour.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class LocalReranker(SecondStage):
         self._verifier, self._database, self._queries = verifier, database, queries
 
     def compare(self, query: int, candidates: Sequence[int]) -> Iterable[int]:
-        """Count the inliers of a query with each candidate."""
+        """Count the inliers between a query and each candidate; all are given by index."""
         if not candidates:
             return []
         files = [self._database[each] for each in candidates]
@@ -38,5 +38,5 @@ class LocalReranker(SecondStage):
         return [check.inliers for check in checks]
 
     def order(self, scores: np.ndarray, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Order the candidates; see `order_by_inliers`."""
+        """Order candidates by similarity and inliers (the scores), as `order_by_inliers` does."""
         return order_by_inliers(similarities, scores), scores

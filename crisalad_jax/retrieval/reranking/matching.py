@@ -24,9 +24,9 @@ from crisalad_jax.utils import compiler
 Features = Float[np.ndarray, "*candidate feature dim"]
 """Local features of an image, or of each candidate."""
 Scores = Float[np.ndarray, "candidate *part"]
-"""Scores of the candidates of a query: one each, or one for each part."""
+"""Scores of a query's candidates: one each, or one for each part, such as a window size."""
 INLIER_DISTANCE = 1.5
-"""Maximum distance of an inlier from where the homography maps it, in patches (public code)."""
+"""Maximum distance, in patches, of an inlier from its match under the homography (public code)."""
 _LEAST_MATCHES = 4
 """Minimum number of matches for a homography."""
 
@@ -34,10 +34,10 @@ _LEAST_MATCHES = 4
 def mutual_matches(
     query: Float[AnyArray, "m d"], candidate: Float[AnyArray, "n d"], above: float = -math.inf
 ) -> Int[Array, " m"]:
-    """Match mutual nearest patches: find the candidate's patch for each patch of the query.
+    """Find the mutual nearest patch in the candidate, by index, for each patch of the query.
 
-    The nearest patch has the largest inner product; ties go to the first. The result is -1 where no
-    match has a product larger than `above`. Patches of zeros match nothing.
+    The nearest patch has the largest inner product; ties go to the first. The result is -1 where
+    there is no mutual match with a product above `above`. All-zero patches match nothing.
     """
     query, candidate = query.astype(jnp.float32), candidate.astype(jnp.float32)
     products = jnp.matmul(query, candidate.T, precision=jax.lax.Precision.HIGHEST)
@@ -51,10 +51,10 @@ def mutual_matches(
 def spatial_score(matches: Int[Array, " m"], grid: tuple[int, int]) -> Float[Array, ""]:
     """Compute Patch-NetVLAD's rapid spatial score (Hausler et al., CVPR 2021, section 3.4).
 
-    The deviation of a match's displacement from the mean is subtracted from the largest possible
-    displacement on the grid. The squares are summed over matches, rows and columns, and divided by
-    the number of patches. A deviation beyond the largest displacement adds nothing; the printed
-    formula would add its square again.
+    For each match, in rows and in columns, the deviation of its displacement from the mean is
+    subtracted from the largest displacement that the grid allows. The squared differences are
+    summed and divided by the number of patches. A negative difference counts as 0, although the
+    printed formula squares it.
 
     Args:
         matches: from `mutual_matches`, of patches in row order.
@@ -76,7 +76,7 @@ def _places(patches: Int[Array, " m"], grid: tuple[int, int]) -> Int[Array, "m 2
 def inliers(matches: Int[np.ndarray, " m"], grid: tuple[int, int]) -> int:
     """Count the matches that one homography explains, found by RANSAC with a fixed seed.
 
-    The arguments are those of `spatial_score`. Fewer than four matches have no homography.
+    The arguments are those of `spatial_score`. With fewer than four matches, the count is 0.
     """
     query = np.flatnonzero(matches >= 0)
     if len(query) < _LEAST_MATCHES:
@@ -120,13 +120,13 @@ def describe_selavpr(
 
 
 def count_matches(query: Features, candidates: Features, config: ModelConfig) -> Scores:
-    """Count the mutual matches (SelaVPR, section 3.4)."""
+    """Count the mutual matches of a query with each candidate (SelaVPR, section 3.4)."""
     matches = np.asarray(match_all(query, candidates))
     return (matches >= 0).sum(axis=1).astype(np.float32)
 
 
 def selavprpp_shape(config: ModelConfig) -> tuple[int, int]:
-    """Return 1 and the length of SelaVPR++'s real-valued descriptor."""
+    """Return the number of features, 1, and the length of SelaVPR++'s real-valued descriptor."""
     assert isinstance(config.aggregator, SelaVprPpHashConfig)
     return 1, config.aggregator.dim
 
@@ -144,7 +144,7 @@ def describe_selavprpp(
 
 
 def nearness(query: Features, candidates: Features, config: ModelConfig) -> Scores:
-    """Compute the negative distance between the single features of query and candidates."""
+    """Compute the negative Euclidean distance of the query's one feature to each candidate's."""
     return -np.linalg.norm(candidates[:, 0] - query[0], axis=1)
 
 
@@ -165,6 +165,6 @@ def describe_transvpr(
 
 
 def count_inliers(query: Features, candidates: Features, config: ModelConfig) -> Scores:
-    """Count the mutual matches that are inliers of RANSAC (TransVPR, section 3.3)."""
+    """Count each candidate's mutual matches that are RANSAC inliers (TransVPR, section 3.3)."""
     matches = np.asarray(match_all(query, candidates))
     return np.array([inliers(each, config.grid) for each in matches], np.float32)

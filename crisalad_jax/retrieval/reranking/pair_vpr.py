@@ -26,7 +26,7 @@ def scores(
     candidates: Float[AnyArray, "candidate patch dim"],
     config: ModelConfig,
 ) -> Float[Array, " candidate"]:
-    """Sum the logits of each pair in both orders."""
+    """Score each candidate: sum the decoder's logits of (query, candidate) and the reverse pair."""
     assert isinstance(config.aggregator, PairVprConfig)
     theirs = jnp.asarray(candidates, config.compute_dtype)
     ours = jnp.broadcast_to(jnp.asarray(query, config.compute_dtype), theirs.shape)

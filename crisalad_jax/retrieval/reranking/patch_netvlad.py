@@ -29,16 +29,16 @@ from crisalad_jax.utils.errors import InputError
 Grid = tuple[int, int]
 
 WINDOWS = ((2, 0.45), (5, 0.15), (8, 0.4))
-"""Window sides in patches and weights of the paper's multi-scale score; the stride is a patch."""
+"""Window sides (in patches) and weights of the paper's multi-scale score; the stride is 1."""
 
 
 def windows_of(config: ModelConfig) -> list[tuple[int, float, Grid]]:
-    """List side, weight, and rows and columns of the windows that fit the images of a model.
+    """List side, weight and grid (rows, columns) of the window sizes that fit a model's images.
 
-    Sizes of which fewer than 2 x 2 fit are left out: a single window cannot be displaced.
+    Sizes of which fewer than 2 x 2 windows fit are left out: a single one cannot be displaced.
 
     Raises:
-        InputError: no size fits.
+        InputError: no window size fits.
     """
     rows, columns = config.grid
     fitting = [
@@ -65,10 +65,10 @@ def window_vlads(
 ) -> Float[Array, "window vlad"]:
     """Compute a VLAD for every window of side x side patches, in row order (Eq. 2 and 4).
 
-    Assigned residuals are summed, and normalised first per cluster, then as a whole. Neighbouring
-    windows share sums along rows, then along columns. The paper's integral features need fewer
-    additions, but subtract large sums: for a cluster with little mass in a window, only rounding
-    errors would remain, which the normalisation would scale up.
+    A window's residuals from the centroids are weighted by `assignment`, summed, and normalised per
+    cluster, then as a whole. Neighbouring windows share partial sums. The paper's integral features
+    need fewer additions, but subtract large sums: for a cluster with little mass in a window, only
+    rounding errors would remain, which the normalisation would scale up.
     """
     residuals = assignment[:, :, None] * (features[:, None, :] - centroids)
     sums = residuals.reshape(*grid, *centroids.shape)
@@ -81,10 +81,10 @@ def window_vlads(
 
 
 def shape(config: ModelConfig) -> tuple[int, int]:
-    """Return the number of windows of an image, of all sizes, and the length of a descriptor.
+    """Return the number of an image's windows, of all sizes, and the length of their descriptors.
 
     Raises:
-        InputError: what `windows_of` raises; the descriptors would not be unit vectors.
+        InputError: no window size fits the images, or the model's descriptors are not unit vectors.
     """
     check_unit_length(config, "rerank")
     windows = sum(rows * columns for _, _, (rows, columns) in windows_of(config))
@@ -95,7 +95,7 @@ def shape(config: ModelConfig) -> tuple[int, int]:
 def describe(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image window dim"]:
-    """Compute unit descriptors of all windows, the smallest size first, in float16.
+    """Compute unit descriptors of all windows of every image, smallest size first, in float16.
 
     The model's projection, if it has one, reduces each window's VLAD as it does the image's.
     """
@@ -123,7 +123,7 @@ def spatial_scores(
     candidates: Float[AnyArray, "candidate window dim"],
     config: ModelConfig,
 ) -> Float[Array, "candidate size"]:
-    """Compute the rapid spatial score of each window size (paper section 3.4)."""
+    """Compute each candidate's rapid spatial score at each window size (paper section 3.4)."""
 
     def of_one(candidate: AnyArray) -> Array:
         matched = [(mutual_matches(query[w], candidate[w]), grid) for w, grid in _parts(config)]
@@ -145,7 +145,7 @@ def _matches_to(
 
 
 def inlier_scores(query: Features, candidates: Features, config: ModelConfig) -> Scores:
-    """Compute the share of windows of each size that are RANSAC inliers (paper section 3.4).
+    """Compute the share of RANSAC inliers among the windows of each size (paper section 3.4).
 
     As in the authors' code, the homography maps the candidate's windows to the query's.
     """
@@ -166,14 +166,14 @@ def _parts(config: ModelConfig) -> list[tuple[slice, Grid]]:
 
 
 def weighted_sum(scores: Scores, config: ModelConfig) -> Scores:
-    """Sum the scores of all sizes, weighted (paper Eq. 6)."""
+    """Sum each candidate's scores of all window sizes, weighted by `WINDOWS` (paper Eq. 6)."""
     return scores @ np.array([weight for _, weight, _ in windows_of(config)])
 
 
 def standardised_sum(scores: Scores, config: ModelConfig) -> Scores:
-    """Standardise the scores of each size over a query's candidates, then sum them, weighted.
+    """Standardise the scores of each window size over a query's candidates, then sum them weighted.
 
-    The authors' code does so before Eq. 6. A size at which all scores are equal adds 0.
+    The authors' code standardises before Eq. 6. A size at which all scores are equal adds 0.
     """
     # In float64, the mean of equal float32 values is exact, so their deviation is 0.
     scores = scores.astype(np.float64)

@@ -13,10 +13,10 @@ from crisalad_jax.utils.shapes import Int
 
 
 class SecondStage:
-    """Re-ranks the first neighbours of each query; use it as a context manager."""
+    """A callable that re-ranks the first neighbours of each query; use it as a context manager."""
 
     def __init__(self, label: str, top: int, reading: Reading) -> None:
-        """Set the label of progress bars, and the number of neighbours to re-rank."""
+        """Set the label of progress bars, the neighbours to re-rank, and how images are read."""
         self._label, self._top, self._reading = label, top, reading
         self._scores: dict[tuple[int, int], Any] = {}
 
@@ -25,13 +25,13 @@ class SecondStage:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Release its resources."""
+        """Release the resources of the second stage."""
 
     def prepare(self, first: Int[np.ndarray, "query candidate"]) -> None:
-        """Compute what depends only on single images."""
+        """Compute what depends on single images; `first` has the candidates of each query."""
 
     def compare(self, query: int, candidates: Sequence[int]) -> Iterable[Any]:
-        """Score candidates of a query, each independently."""
+        """Score each candidate of a query independently; images are given by index."""
         raise NotImplementedError
 
     def order(self, scores: np.ndarray, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +39,7 @@ class SecondStage:
         raise NotImplementedError
 
     def __call__(self, neighbours: Neighbours) -> Neighbours:
-        """Sort the first `top` neighbours of each query by descending score.
+        """Re-rank the first `top` neighbours of each query; `top` is an argument of the class.
 
         Ties, and neighbours after the first `top`, stay in the order of the first stage. Scores
         replace the similarities of the re-ranked neighbours.
@@ -63,5 +63,5 @@ class SecondStage:
         return Neighbours(indices, similarities)
 
     def bar(self, what: str, count: int, unit: str) -> contextlib.AbstractContextManager[Bar]:
-        """Show the progress of one part of the work."""
+        """Show a progress bar for one part of the work, of `count` units."""
         return progress_bar(f"{self._label}, {what}", count, unit, quiet=self._reading.quiet)

@@ -28,21 +28,21 @@ from crisalad_jax.utils.shapes import Bool, Float, Int
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """The local features of a second stage, and its scores of pairs of images."""
+    """A method of re-ranking: which local features it computes, and how it scores image pairs."""
 
     aggregator: str | None
-    """Name of the aggregator that models need; None takes any model with features to compare."""
+    """Name of the aggregator that the model must have; None accepts any that has local features."""
     shape: Callable[[ModelConfig], tuple[int, int]]
-    """Returns the number of an image's features, and their length."""
+    """Returns the number of local features of an image, and their length."""
     describe: Callable[[Crisalad, Any, ModelConfig], Any]
-    """Computes the features of a batch of images."""
+    """Computes the features of a batch of images, (image, feature, length)."""
     score: Callable[..., Any]
-    """Scores any number of candidates of a query independently: one score, or one for each part.
-    It takes the features of the query and of the candidates, and the configuration."""
+    """Scores each candidate of a query independently: one score, or one for each part, such as a
+    window size. Takes the features of the query, those of the candidates, and the configuration."""
     fuse: Callable[[np.ndarray, ModelConfig], Float[np.ndarray, " candidate"]] = (
         lambda scores, config: scores
     )
-    """Combines the scores of parts into one, for all candidates of a query together."""
+    """Combines the scores of the parts into one per candidate, for all candidates of a query."""
     dtype: type[np.floating] = np.float16
     """Type of the features in the temporary file."""
     by_params: bool = False
@@ -82,7 +82,7 @@ _METHODS: Mapping[str, Method | None] = {
     ),
 }
 RERANKERS = tuple(_METHODS)
-"""Names of the second stages. A method that is None needs no model for its local features."""
+"""Names of the methods of re-ranking; all but "local" compute local features by a model."""
 _AT_ONCE = 16
 """Maximum number of candidates of a query that are scored together."""
 _NUMBERS = 2**25
@@ -100,15 +100,15 @@ class Reranking:
     """
 
     name: str
-    """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, with a NetVLAD model; fol,
-    pair-vpr, selavpr or transvpr, with a model of that aggregator; selavprpp, with selavprpp-hash;
-    sinkhorn-divergence, with local tokens; local, with SIFT or `matcher`."""
+    """Method: patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum with a NetVLAD model; fol,
+    pair-vpr, selavpr or transvpr with a model of that aggregator; selavprpp with a selavprpp-hash
+    model; sinkhorn-divergence with one that has local tokens; local with SIFT or `matcher`."""
     top: int
-    """Number of first retrievals of a query to re-rank; the later ones keep their places."""
+    """Number of best retrievals per query to re-rank; the others stay in their places."""
     model: Model | None = None
     """The model for the local features; None uses the first stage's."""
     matcher: str | os.PathLike[str] | None = None
-    """For local, the ONNX file of `Verify.matcher`; None is SIFT."""
+    """For the method local, the ONNX file of a matcher (see `OnnxMatcher`); None is SIFT."""
 
     def __post_init__(self) -> None:
         """Check the name and the number."""
@@ -129,11 +129,11 @@ class Reranking:
         return _METHODS[self.name] is not None
 
     def check(self, config: ModelConfig, database: int | None = None) -> None:
-        """Check that this re-ranking fits a first stage of `config`.
+        """Check that this re-ranking can follow a first stage whose model has `config`.
 
         Raises:
-            InputError: the model for local features has another aggregator, or its images have too
-                few patches; `top` is above the number of images in `database`, if that is given.
+            InputError: the model for local features has another aggregator or size rule, or images
+                of too few patches; or `top` is above the number of `database` images, if given.
         """
         method, own = _METHODS[self.name], config if self.model is None else self.model.config
         if method is not None:
@@ -159,7 +159,7 @@ class Reranking:
         """Create the second stage for these images; use it as a context manager.
 
         Raises:
-            InputError: what `check` and `open_matcher` raise.
+            InputError: no `model` for a method that needs one; what `check` or `Verifier` raises.
         """
         if self.needs_model:
             return Reranker(self, database, queries, reading)
@@ -171,7 +171,7 @@ def parse_reranking(text: str) -> Reranking:
     """Parse NAME:TOPK, as in patch-netvlad:100.
 
     Raises:
-        InputError: the form, the name or the number is wrong.
+        InputError: the text has another form, the name is unknown, or the number is below 2.
     """
     match = re.fullmatch(r"(.+):([0-9]{1,9})", text)
     if match is None:
@@ -195,8 +195,8 @@ class Reranker(SecondStage):
     """Re-ranks the neighbours of any number of first stages over the same images.
 
     Local features of the queries and of the retrieved database images are computed once, in batches
-    of `batch_size`. Temporary files hold them, mostly in float16, and the system caches these in
-    memory if there is room; scores of pairs stay in memory. The device scores up to 16 candidates
+    of `batch_size`, and stored in temporary files, mostly in float16, which the system caches in
+    memory if there is room. Scores of pairs stay in memory. The device scores up to 16 candidates
     of a query at a time, in one compiled program.
     """
 
@@ -210,7 +210,7 @@ class Reranker(SecondStage):
         """Prepare the second stage of a re-ranking with a model; use it as a context manager.
 
         Raises:
-            InputError: no model, or what `Reranking.check` raises.
+            InputError: no model is given, or what `Reranking.check` raises.
         """
         method = _METHODS[reranking.name]
         if method is None or reranking.model is None:
@@ -239,7 +239,7 @@ class Reranker(SecondStage):
         self._folder.cleanup()
 
     def prepare(self, first: Int[np.ndarray, "query candidate"]) -> None:
-        """Compute the features of all queries and of their candidates."""
+        """Compute the features of all queries and of their candidates, except known ones."""
         self._describe(self._queries, np.arange(len(first)), "queries")
         self._describe(self._database, np.unique(first), "candidates")
 
@@ -269,7 +269,7 @@ class Reranker(SecondStage):
                 bar.advance(len(rows))
 
     def compare(self, query: int, candidates: Sequence[int]) -> Iterator[float | list[float]]:
-        """Yield the score of a query with each candidate, or a list if the method has several."""
+        """Yield the score of a query with each candidate; a list if the method scores parts."""
         patches, dim = self._queries.features.shape[1:]
         step = max(1, min(_AT_ONCE, self._top, _NUMBERS // (patches * dim)))
         given = (self._params,) if self._method.by_params else ()
@@ -283,6 +283,6 @@ class Reranker(SecondStage):
             yield from np.asarray(found)[: len(part)].tolist()
 
     def order(self, scores: np.ndarray, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Order candidates by their scores, fused if each has several; ignore similarities."""
+        """Order candidates by score, fusing the scores of parts; similarities are not used."""
         fused = self._method.fuse(scores, self._config).astype(np.float32)
         return np.argsort(-fused, kind="stable"), fused

@@ -1,4 +1,4 @@
-"""The HTTP interface: routes, access control, and errors as JSON."""
+"""The HTTP interface of a served map: routes, access control, and errors as JSON."""
 
 import asyncio
 import base64
@@ -66,9 +66,9 @@ from crisalad_jax.utils.output import one_line, printable
 from crisalad_jax.utils.version import VERSION
 
 MOST_ANSWERS = 100
-"""Maximum k."""
+"""Maximum number of answers to a picture."""
 MOST_PIXELS = 2**26
-"""Default maximum of pixels in a picture; some phones exceed it at their highest setting."""
+"""Default maximum number of pixels in a picture; the highest setting of some phones exceeds it."""
 _LANES = ((2**21, 4), (2**24, 1), (math.inf, 1))
 """Maximum pixels of a picture, and how many such pictures are decoded at once: large ones, which
 take seconds each, do not hold up small ones."""
@@ -90,7 +90,7 @@ def _hash(tag: str) -> str:
 
 
 def headers(tiles: Tiles | None = None) -> dict[str, str]:
-    """Return the headers of every response."""
+    """Return the HTTP headers of every response, which allow the page to load `tiles`."""
     return {
         # The page holds its style and its script; nothing else runs in it.
         "Content-Security-Policy": (
@@ -115,24 +115,24 @@ class Verified:
     inliers: int
     matches: int
     confidence: float
-    """From 0 to 1; at 1 both count as views of one scene."""
+    """From 0 to 1; at 1, the picture and the answer count as views of one scene."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Neighbour:
-    """An image of the map."""
+    """An image of the map, as an answer to a picture."""
 
     rank: int
-    """From 1, the most similar."""
+    """Rank from 1, the best answer."""
     name: str
     similarity: float
-    """Cosine of the two descriptors."""
+    """Cosine of the descriptors of the picture and the image."""
     position: dict[str, float] | None
-    """east and north, or x and y, in metres, or lat and lon in degrees."""
+    """east and north, or x and y, in metres; or lat and lon in degrees; null if unknown."""
     number: int
-    """Its picture is at /images/{number}, even after others are removed from the map."""
+    """Its thumbnail is at /images/{number}, even after other images are removed from the map."""
     verified: Verified | None = None
-    """For the first answers, if the service verifies them."""
+    """Verification, for the first answers if the service verifies them; otherwise null."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Located:
     known: bool | None
     """Whether the picture shows a place of the map, if the map is calibrated; otherwise null."""
     latency_ms: float
-    """From the last byte of the picture to the answer."""
+    """Milliseconds from the last byte of the picture to the answer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Appended:
     name: str
     position: dict[str, float] | None
     images: int
-    """Number of images of the map."""
+    """Number of images in the map, including this one."""
     latency_ms: float
 
 
@@ -167,28 +167,28 @@ class Health:
     model: str
     """Digest of the model that made the map."""
     search: str
-    """exact, hnsw or ivf-rabitq."""
+    """How the map is searched: exact, hnsw, ivf-rabitq, or with Milvus also diskann."""
     stale_search: str | None
-    """An approximate search that lacks images, unused until it is rebuilt; otherwise null."""
+    """Kind of an approximate search for other images, unused until rebuilt; otherwise null."""
     uptime_s: float
 
 
 @dataclasses.dataclass(frozen=True)
 class Places:
-    """The map, for a page that draws it."""
+    """A map and the positions of its images, for a page that draws them."""
 
     name: str
     images: int
     axes: tuple[str, str] | None
     zone: str | None
     positions: list[tuple[int, float, float]]
-    """(number, position), evenly sampled if there are many."""
+    """(number, first coordinate, second) of images with a position; a sample if there are many."""
     positions_known: int
     appends: bool
     k: int
     max_bytes: int
     tiles: Tiles | None
-    """What the page draws behind them; null for nothing."""
+    """Street map tiles that the page draws behind the positions; null for none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -283,16 +283,16 @@ def make_app(
 
     Args:
         worker: the worker of the map.
-        host: the name or address that it is served at; without a token, requests must name it.
-        token: the token that requests must send; None needs none, and accepts only this machine.
-        appends: whether the map is open for appending.
-        map_images: folder of the map's images; None is the original one.
+        host: name or address of the service; without a token, requests must name it or localhost.
+        token: the token that requests must send; None requires none.
+        appends: whether requests may append images; the map must then be open for appending.
+        map_images: folder of the map's images; None is the one from which they were indexed.
         k: default number of answers to a picture.
         max_bytes: maximum size of a request body.
         max_pixels: maximum pixels of a picture in a request.
-        most_waiting: maximum number of requests with a picture at once; more should retry later.
-        tiles: what the page draws behind the map's places.
-        rerank: how to verify the best answers; None for no verification.
+        most_waiting: maximum number of requests with a picture at once; others get status 503.
+        tiles: street map tiles that the page draws behind the positions; None for none.
+        rerank: how to verify the best answers by local features; None for no verification.
 
     Returns:
         An ASGI application.

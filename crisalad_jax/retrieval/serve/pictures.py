@@ -46,10 +46,10 @@ Image.MAX_IMAGE_PIXELS = None  # `check_picture` has its own limit, and decodes 
 
 
 async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str]:
-    """Receive the file and name of a picture, from the body or the form field `image`.
+    """Receive the bytes and file name of a picture, from the body or the form field `image`.
 
     Raises:
-        HTTPException: it is too large or too slow, or the form has other fields.
+        HTTPException: the request has too many bytes or is too slow, or a form has other fields.
     """
     received = 0
 
@@ -82,10 +82,10 @@ async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str
 
 
 def check_picture(data: bytes, name: str, most_pixels: int) -> float:
-    """Check a picture's header before decoding it; return the maximum number of pixels to decode.
+    """Check a picture's header; return its number of pixels, or infinity if it may be exceeded.
 
     Raises:
-        InputError: it has another format, is too large, or is a JPEG with too many scans.
+        InputError: not an accepted format, too many pixels, or a JPEG with too many scans.
     """
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
@@ -106,8 +106,8 @@ def check_new_name(name: str) -> None:
     """Check that a name is a plain path below a folder, without hidden parts.
 
     Raises:
-        InputError: a part is empty, hidden or too long, there are too many, the name has control
-            characters or was not UTF-8, or it is the name of a frame of a video or log.
+        InputError: a part is empty, hidden or too long; there are too many parts; or the name has
+            control characters, was not UTF-8, or is that of a frame of a video or robot log.
 
     Example:
         >>> check_new_name("tuesday/0001.jpg")
@@ -126,10 +126,10 @@ def check_new_name(name: str) -> None:
 
 
 def image_in(places: Map, row: int) -> MapImage:
-    """Return the image of a map in a row of its store; a row is never given to another image.
+    """Return the image in a row of a map's store; a row is never reused for another image.
 
     Raises:
-        InputError: the map does not have such an image, or no longer has it.
+        InputError: there is no such row, or its image was removed from the map.
     """
     number = int(places.removed.numbers_of(np.array(row)))
     if not 0 <= number < len(places):
@@ -142,15 +142,15 @@ def image_in(places: Map, row: int) -> MapImage:
 def read_thumbnail(
     image: MapImage, folder: pathlib.Path, images: str | os.PathLike[str] | None
 ) -> bytes:
-    """Return a small JPEG of an image of a map.
+    """Return an image of a map as a JPEG of at most 480 pixels on its longer side.
 
     Args:
         image: the image.
         folder: the folder of the map.
-        images: folder of the map's images; None is the original one.
+        images: folder to look in before the one from which the image was indexed; None for none.
 
     Raises:
-        InputError: its file is missing, changed or unreadable.
+        InputError: the image's file is missing, of another size, or unreadable.
     """
     # The record of a map ensures that names stay below a folder.
     folders = [*([] if images is None else [images]), image.root, folder / ADDED]

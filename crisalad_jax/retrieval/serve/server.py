@@ -73,26 +73,26 @@ def serve_map(
     Requests in flight are answered before it stops; then the signal has its usual effect.
 
     Args:
-        folder: the map.
-        weights: the file of its model; None is the one that the map records.
+        folder: folder of the map.
+        weights: file of the model that made the map; None is the one that the map records.
         engine: "jax", "onnxruntime" or "openvino"; or "auto", the one that `Map.fastest_engine`
             chooses.
-        host: name or address to listen on. Any that others can reach needs a token.
+        host: name or address to listen on. One that other machines can reach needs a token.
         port: port to listen on; 0 picks a free one.
         token: token that requests must send as `Authorization: Bearer ...`; None for no token.
         k: default number of answers to a picture.
-        append: whether requests may add images to the map; no other process can do so then.
-        map_images: folder of the map's pictures; None is the original one.
+        append: whether requests may add images to the map; other processes then cannot.
+        map_images: folder of the map's images; None is the one from which they were indexed.
         max_bytes: maximum size of a request body.
         max_pixels: maximum pixels of a picture in a request.
         batch_size: maximum number of pictures described together, each independently.
         tiles: address of street map tiles, which browsers draw behind the map's places:
             https://tile.openstreetmap.org/{z}/{x}/{y}.png. None draws none.
-        tiles_attribution: text to show with them; None is what OpenStreetMap requires for its own.
+        tiles_attribution: text shown with tiles; None is what OpenStreetMap requires for its own.
         rerank: how to verify the best answers by local features; None for no verification.
         verify: whether to compare the map's descriptors with their checksums.
         quiet: whether to hide the progress bar.
-        ready: called with the service's address and the engine once it answers.
+        ready: called with (address, engine) once the service answers.
 
     Raises:
         InputError: a number out of range; an address that is not this machine's, is in use, or can
@@ -190,7 +190,7 @@ class _Connection(H11Protocol):
 
 
 class Server(uvicorn.Server):
-    """An HTTP server that stops on a deferred signal."""
+    """An HTTP server that stops on a signal, once `defer_signals` has recorded one."""
 
     def __init__(
         self,
@@ -199,7 +199,7 @@ class Server(uvicorn.Server):
         ready: Callable[[], object],
         tiles: Tiles | None = None,
     ) -> None:
-        """Set the application, the signals, what to call once it answers, and the page's tiles."""
+        """Set the application, the recorded signals, what to call once ready, and the tiles."""
         config = uvicorn.Config(
             app,
             loop="asyncio",  # uvloop would take the signals that `defer_signals` handles
@@ -223,7 +223,7 @@ class Server(uvicorn.Server):
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, and call `ready`."""
+        """Start listening, and call `ready`."""
         await super().startup(sockets)
         # uvicorn has one number for both; accepting that many at once would use all descriptors.
         for listener in sockets or ():
@@ -231,7 +231,7 @@ class Server(uvicorn.Server):
         self._ready()
 
     async def on_tick(self, counter: int) -> bool:
-        """Check for a signal and for clients that are too slow, ten times a second."""
+        """Drop slow clients, and return whether to stop; called ten times a second."""
         now = asyncio.get_running_loop().time()
         connections: tuple[Any, ...] = tuple(self.server_state.connections)
         for each in connections:
@@ -269,7 +269,7 @@ def _check_access(host: str, token: str | None) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a name or address is this machine's own, which others cannot reach."""
+    """Return whether a host name or address is a loopback one, out of reach for other machines."""
     try:
         return host.lower() == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -13,31 +13,31 @@ _OPENSTREETMAP = "© OpenStreetMap contributors"
 
 @dataclasses.dataclass(frozen=True)
 class Tiles:
-    """Where a browser gets tiles from: squares of 256 pixels in Web Mercator."""
+    """The source of a browser's map tiles, which are 256 pixels square, in Web Mercator."""
 
     url: str
     """Address with {z}, {x} and {y} for the zoom, column and row of a tile."""
     attribution: str
-    """Text that the page shows with them."""
+    """Text that the page shows with the tiles."""
 
     @property
     def origin(self) -> str:
-        """Scheme, host and port, which the page's content security policy allows."""
+        """Scheme, host and port of the address, which the content security policy allows."""
         return self.url[: self.url.index("/", len("https://"))]
 
 
 def open_tiles(url: str, attribution: str | None, places: Map) -> Tiles:
-    """Check the address of tiles, and that the positions of a map can be drawn on them.
+    """Make `Tiles`, after checking their address and that a map's positions fit on them.
 
     Args:
-        url: the address.
-        attribution: text to show with them; None is what OpenStreetMap requires for its own tiles,
-            and nothing for others.
+        url: the tiles' address, with {z}, {x} and {y}.
+        attribution: text to show with the tiles; None is the text that OpenStreetMap requires for
+            its own tiles, and no text for others.
         places: the map.
 
     Raises:
-        InputError: not an address of tiles; or positions that are neither degrees nor metres of a
-            known UTM zone.
+        InputError: the address is not one of tiles; or the map's positions are neither in degrees
+            nor in metres of a known UTM zone.
     """
     if not _ADDRESS.fullmatch(url) or any(url.count(f"{{{axis}}}") != 1 for axis in "xyz"):
         raise InputError(

@@ -27,13 +27,13 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.temporaries import made_folder
 
 ADDED = "added"
-"""Subfolder of the map for images that requests added."""
+"""Name of the map's subfolder for images that requests have added."""
 _LONGEST_FILE = 3800
 """Maximum bytes of a full path. Linux allows 4,095; the name of a temporary file is longer."""
 
 
 class NameTakenError(InputError):
-    """The map already has an image of this name."""
+    """The name of a new image is already that of an image or a folder of the map."""
 
 
 class MapFailedError(Exception):
@@ -44,10 +44,10 @@ class Question(NamedTuple):
     """An image to find in the map."""
 
     pixels: Pixels
-    """As `prepare_image` returns them."""
+    """The prepared image, as `prepare_image` returns it."""
     k: int
     where: Where | None = None
-    """Which images of the map to search; None is all."""
+    """Which images of the map to search; None searches all."""
 
 
 class Addition(NamedTuple):
@@ -55,7 +55,7 @@ class Addition(NamedTuple):
 
     pixels: Pixels
     data: bytes
-    """Its file."""
+    """Content of the image file."""
     name: str
     position: Positions | None
 
@@ -67,8 +67,8 @@ class MapWorker:
         """Take the map, open for appending if images will be added, and the model that made it.
 
         Args:
-            places: the map, which the thread owns until it is closed.
-            describer: its model.
+            places: the map, which the thread owns until `close`.
+            describer: the model that made the map.
             batch_size: maximum number of images described together.
         """
         self.places, self._describer, self._batch_size = places, describer, batch_size
@@ -79,7 +79,7 @@ class MapWorker:
         self._thread = ThreadPoolExecutor(1, "map")
 
     def close(self) -> None:
-        """End the thread after everything submitted is done."""
+        """End the thread, once all submitted work is done."""
         self._thread.shutdown()
 
     def compile(self, *, quiet: bool = False) -> None:
@@ -97,13 +97,13 @@ class MapWorker:
         self.places.search(descriptors[:1], 1)
 
     def submit(self, work: Question | Addition) -> "Future[Any]":
-        """Queue work.
+        """Queue a question or an addition.
 
         Returns:
-            A future: for a question, of the map that was searched, and (number, similarity) of its
-            k most similar images; for an addition, of its number. It raises `InputError` if no
-            image meets the conditions or the map refuses the addition (`NameTakenError` for its
-            name), and `MapFailedError` for everything else.
+            A future. For a question, its result is (the searched map, [(number, similarity), ...]),
+            the k most similar images first; for an addition, the new image's number. It raises
+            `InputError` if no image meets the conditions or the map refuses the addition
+            (`NameTakenError` for its name), and `MapFailedError` for everything else.
         """
         result: Future[Any] = Future()
         self._waiting.append((work, result))

@@ -1,1 +1,1 @@
-"""Verify answers by local features: their matches, inliers, and the camera pose they imply."""
+"""Verify answers by local features: matches, inliers, and the camera pose that they imply."""

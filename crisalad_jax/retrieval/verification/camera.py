@@ -1,4 +1,4 @@
-"""Intrinsics of a camera: from pixels to directions."""
+"""Intrinsics of a camera, which convert pixels to directions."""
 
 import dataclasses
 import math
@@ -29,7 +29,7 @@ _EXPECTED = (
 @with_field_docs
 @dataclasses.dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera, with its lens distortion and the size of its images if these are known.
+    """A pinhole camera, with its lens distortion and image size if they are known.
 
     Images of another size are treated as scaled if they have the same aspect ratio.
 
@@ -39,14 +39,14 @@ class Intrinsics:
     """
 
     fx: float
-    """Focal lengths, and the principal point, in pixels."""
+    """Focal length along x in pixels; `fy` is that along y, (`cx`, `cy`) the principal point."""
     fy: float
     cx: float
     cy: float
     width: int | None = None
     height: int | None = None
     distortion: tuple[float, ...] = ()
-    """OpenCV's k1, k2, p1, p2, k3, ...: ROS's plumb_bob and rational_polynomial."""
+    """OpenCV's k1, k2, p1, p2, k3, ... (ROS's plumb_bob, rational_polynomial); empty for none."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -64,14 +64,14 @@ class Intrinsics:
 
     @classmethod
     def parse(cls, text: str | os.PathLike[str]) -> Self:
-        """Read intrinsics from fx,fy,cx,cy or fx,fy,cx,cy,width,height, or from a camera file.
+        """Read intrinsics from text, fx,fy,cx,cy[,width,height] in pixels, or from a camera file.
 
         Args:
             text: these numbers, or a YAML or JSON file: ROS's camera_info (from camera_calibration,
                 or printed by `ros2 topic echo --once`), or the numbers by name.
 
         Raises:
-            InputError: it is neither.
+            InputError: the text is neither, or the file is missing or has no intrinsics.
         """
         parts = os.fspath(text).split(",")
         if len(parts) in (4, 6):
@@ -98,7 +98,7 @@ class Intrinsics:
     def directions(
         self, points: Float64[np.ndarray, "n 2"], size: tuple[int, int], name: str
     ) -> Float64[np.ndarray, "n 2"]:
-        """Convert pixels of an image to undistorted x / z and y / z in the camera's axes.
+        """Convert pixels of an image to undistorted directions, x / z and y / z in camera axes.
 
         Args:
             points: x and y in pixels of the image.
@@ -106,8 +106,8 @@ class Intrinsics:
             name: name of the image, for messages.
 
         Raises:
-            InputError: the camera's images have another aspect ratio, or its principal point is not
-                in the image.
+            InputError: the camera's images have another aspect ratio or, if their size is unknown,
+                its principal point is not in the image.
         """
         height, width = size
         factor = 1.0 if self.width is None else width / self.width
@@ -130,7 +130,7 @@ class Intrinsics:
         return cv2.undistortPoints(own_points[:, None], matrix, coefficients)[:, 0]
 
     def focal(self, width: int) -> float:
-        """Return the mean focal length in pixels of an image of this width."""
+        """Return the mean focal length in pixels for an image that is `width` pixels wide."""
         return (self.fx + self.fy) / 2 * (1.0 if self.width is None else width / self.width)
 
 

@@ -21,7 +21,7 @@ _SURE, _TRIALS = 0.9999, 10_000
 
 
 class Pose(NamedTuple):
-    """A rotation, and a translation of length 1 or in metres."""
+    """A rotation R and a translation t, which map x to R x + t; t is in metres or of length 1."""
 
     rotation: Float64[np.ndarray, "3 3"]
     translation: Float64[np.ndarray, " 3"]
@@ -36,8 +36,8 @@ def epipolar_inliers(first: Points, second: Points, distance: float) -> Bool[np.
     """Find the matches that one fundamental matrix explains, by MAGSAC++ with a fixed seed.
 
     Args:
-        first: pixels in one image.
-        second: the same points in the other.
+        first: pixels (x, y) in one image.
+        second: the matching pixels in the other image; fewer than 8 matches have no inliers.
         distance: maximum distance from an epipolar line, in pixels.
     """
     none = np.zeros(len(first), bool)
@@ -53,12 +53,12 @@ def epipolar_inliers(first: Points, second: Points, distance: float) -> Bool[np.
 def rotation_only(
     first: Points, second: Points, distance: float
 ) -> Float64[np.ndarray, "3 3"] | None:
-    """Compute the rotation between cameras at one place (Kabsch 1976); None if they moved apart.
+    """Compute the rotation between two cameras at one place (Kabsch 1976); None if they are apart.
 
     Args:
         first: directions of points from the first camera.
-        second: the same from the second.
-        distance: maximum distance of a point after rotation, which nine in ten must meet.
+        second: directions of the same points from the second.
+        distance: maximum distance between unit rays after rotation, met by nine points in ten.
     """
     if len(first) < LEAST:
         return None
@@ -71,12 +71,12 @@ def rotation_only(
 
 
 def relative_pose(first: Points, second: Points, distance: float) -> Pose | None:
-    """Compute the pose between two cameras, with a unit translation; None with too few inliers.
+    """Compute the pose between two cameras, with a unit translation; None with under 8 inliers.
 
     Args:
         first: directions of points from the first camera.
-        second: the same from the second.
-        distance: maximum distance from an epipolar line.
+        second: directions of the same points from the second.
+        distance: maximum distance of an inlier from an epipolar line, in the unit of directions.
     """
     if len(first) < LEAST:
         return None
@@ -96,7 +96,7 @@ def relative_pose(first: Points, second: Points, distance: float) -> Pose | None
 def pose_from_points(
     points: Float64[np.ndarray, "n 3"], directions: Points, distance: float
 ) -> Pose | None:
-    """Compute the pose of the camera that sees points in metres (PnP); None if not found."""
+    """Compute a camera's pose from 3D points in metres and their directions, by PnP; or None."""
     if len(points) < LEAST:
         return None
     eye = np.eye(3)
@@ -119,7 +119,7 @@ def pose_from_points(
 def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarray, "n 3"]:
     """Triangulate points, in the second camera's axes, from their directions from two cameras.
 
-    Points behind a camera are NaN.
+    Coordinates are in the unit of the pose's translation; points behind a camera are NaN.
     """
     to_first = np.column_stack(pose.inverse)
     found = cv2.triangulatePoints(np.eye(3, 4), to_first, second.T, first.T)
@@ -129,7 +129,7 @@ def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarra
 
 
 def common_points(first: Points, second: Points) -> tuple[Int64[np.ndarray, " m"], ...]:
-    """Return the rows of two keypoint lists of one image that hold the same keypoints."""
+    """Return the rows at which two lists of keypoints of one image have the same keypoint."""
     rows = {tuple(point): row for row, point in enumerate(first.tolist())}
     points = map(tuple, second.tolist())
     pairs = [(rows[point], row) for row, point in enumerate(points) if point in rows]
@@ -142,13 +142,13 @@ def pose_on_map(
     here: Sequence[float],
     there: Sequence[float],
 ) -> MapPose:
-    """Place a camera on a map, from an answer and the vector to another; all cameras are level.
+    """Compute where a level camera is on a map, and its heading, from two answers' positions.
 
     Args:
-        pose: pose from the camera to the answer's, in metres.
-        other: vector to the other answer's camera, in the answer camera's axes, of any length.
-        here: the answer's position in metres east and north.
-        there: the other's.
+        pose: pose from the camera to that of the first answer, in metres.
+        other: vector from the first answer's camera to the second's, in the first's axes.
+        here: position of the first answer, in metres east and north.
+        there: position of the second answer.
     """
     east, north = np.subtract(there, here)
     heading = np.arctan2(east, north) - np.arctan2(other[0], other[2])

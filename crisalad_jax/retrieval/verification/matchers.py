@@ -35,15 +35,15 @@ _CONTRACT = (
 
 
 class SiftFeatures(NamedTuple):
-    """Local features of an image."""
+    """SIFT features of an image; points are pixels (x, y) of the image file."""
 
     points: Points
     descriptors: Float32[np.ndarray, "n 128"]
-    """Unit vectors."""
+    """RootSIFT descriptors, which are unit vectors."""
 
 
 class SiftMatcher:
-    """SIFT features (Lowe, IJCV 2004) as RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
+    """A matcher of SIFT (Lowe, IJCV 2004) as RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
 
     name: str = "sift"
     """Name of the matcher; inliers of different matchers are not comparable."""
@@ -63,10 +63,10 @@ class SiftMatcher:
         return SiftFeatures((points + 0.5) / factor - 0.5, np.sqrt(rows / sums, dtype=np.float32))
 
     def match(self, query: SiftFeatures, database: SiftFeatures) -> tuple[Points, Points]:
-        """Match mutual nearest neighbours that are much nearer than the second nearest.
+        """Match mutual nearest neighbours, if much nearer than the second nearest (ratio test).
 
         Returns:
-            Pixels (x, y) in each image, row by row.
+            Pixels (x, y) of the matches in the query and in the database image, row by row.
         """
         if min(len(query.points), len(database.points)) < 2:
             return np.zeros((0, 2)), np.zeros((0, 2))
@@ -83,16 +83,16 @@ class SiftMatcher:
 class OnnxMatcher:
     """A matcher and its features in one ONNX program, such as ALIKED or SuperPoint + LightGlue.
 
-    The contract is that of LightGlue-ONNX (github.com/fabio-sim/LightGlue-ONNX): `images` are both
-    images (2, channels, height, width) from 0 to 1, RGB or grey. `keypoints` (2, n, 2) are x and y
-    in these pixels, `matches` (m, 3) the index of the pair, 0, and a keypoint of each image.
+    The contract is that of LightGlue-ONNX (github.com/fabio-sim/LightGlue-ONNX): the input is both
+    images (2, channels, height, width) from 0 to 1, RGB or grey. Outputs: `keypoints` (2, n, 2), x
+    and y in these pixels; `matches` (m, 3), rows of 0 and the index of a keypoint in each image.
     """
 
     def __init__(self, file: pathlib.Path) -> None:
         """Load the program with onnxruntime.
 
         Raises:
-            InputError: it is missing, or does not follow the contract.
+            InputError: the file is missing, or the program does not follow the contract.
         """
         check_source(file, "a matcher (.onnx)")
         try:
@@ -131,7 +131,7 @@ class OnnxMatcher:
         self.name = f"onnx {sha256_of(file)}"
 
     def prepare(self, image: Image) -> tuple[np.ndarray, np.ndarray]:
-        """Resize an image to the program's size, and return it with its reduction factors."""
+        """Resize an image to the program's size; return it with its (x, y) reduction factors."""
         height, width = self._sides
         resized = resize_image(image, (height, width), filter="area")
         if self._channels == 1:
@@ -140,7 +140,7 @@ class OnnxMatcher:
         return np.moveaxis(resized, -1, 0) / 255, factors
 
     def match(self, query: Any, database: Any) -> tuple[Points, Points]:
-        """Match two prepared images."""
+        """Match two prepared images; the result is that of `SiftMatcher.match`."""
         images = np.stack([query[0], database[0]]).astype(self._type)
         try:
             keypoints, matches = self._run({self._input: images})
@@ -157,11 +157,11 @@ class OnnxMatcher:
 
 
 Matcher = SiftMatcher | OnnxMatcher
-"""Finds the matches of two images, each of which is prepared once."""
+"""Finds matching points of two images, each of which is prepared once."""
 
 
 def open_matcher(file: str | os.PathLike[str] | None) -> Matcher:
-    """Open the matcher in an ONNX file; the default is SIFT.
+    """Open the matcher in an ONNX file; None is SIFT.
 
     Raises:
         InputError: the file does not exist, or is a program of another kind.

@@ -24,21 +24,21 @@ class Verification(NamedTuple):
     """inliers / (8 + 0.3 matches), at most 1: at 1, Brown and Lowe (IJCV 2007, section 3.2) accept
     two images as views of one scene."""
     query_points: Float64[np.ndarray, "inlier 2"]
-    """Pixels of the inliers in the query's file, x and y."""
+    """Pixels (x, y) of the inliers in the query's file."""
     database_points: Float64[np.ndarray, "inlier 2"]
-    """The same points in the answer's file."""
+    """Pixels (x, y) of the same inliers in the answer's file."""
     rotation: Float64[np.ndarray, "3 3"] | None = None
     """Rotates vectors from the query camera's axes to the answer camera's; None without intrinsics,
-    or at a confidence below 1."""
+    at a confidence below 1, or if no pose is found."""
     direction: Float64[np.ndarray, " 3"] | None = None
-    """Unit vector to the query's camera, in the answer camera's axes; None like `rotation`, and if
-    both cameras were at one place."""
+    """Unit vector from the answer's camera to the query's, in the answer camera's axes. None if
+    `rotation` is None, or if both cameras were at the same place."""
     translation: Float64[np.ndarray, " 3"] | None = None
     """Metres from the answer's camera to the query's, in the answer camera's axes; None without
     depth or a second answer at a known distance."""
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields for JSON: without the points, and with a quaternion (x, y, z, w)."""
+        """Return the fields for JSON, without points, the rotation as a quaternion (x, y, z, w)."""
         fields: dict[str, Any] = {"inliers": self.inliers, "matches": self.matches}
         fields["confidence"] = round(self.confidence, 4)
         if self.rotation is not None:
@@ -59,6 +59,6 @@ class MapPose(NamedTuple):
     """The pose of a query's camera on the map, from two answers with positions."""
 
     position: tuple[float, float]
-    """Position in the map's axes."""
+    """Position along the map's axes: metres, or latitude and longitude."""
     heading: float
-    """View direction in degrees clockwise from north (the second axis: y, or latitude)."""
+    """View direction in degrees clockwise from north, or in a map of x and y from the y axis."""

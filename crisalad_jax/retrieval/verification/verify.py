@@ -58,21 +58,21 @@ class Verify:
     """
 
     answers: int = 10
-    """Number of best answers per query to verify and reorder, see `order_by_inliers`."""
+    """Number of best answers per query to verify and reorder (see `order_by_inliers`)."""
     matcher: str | os.PathLike[str] | None = None
-    """ONNX file of a matcher, see `OnnxMatcher`; None is SIFT."""
+    """ONNX file of a matcher (see `OnnxMatcher`); None is SIFT."""
     intrinsics: Intrinsics | None = None
     """Intrinsics of the queries' camera, for rotations and directions; None gives only inliers."""
     map_intrinsics: Intrinsics | None = None
-    """Intrinsics of the map's camera; None is `intrinsics`."""
+    """Intrinsics of the camera of the map's images; None is `intrinsics`."""
     map_images: str | os.PathLike[str] | None = None
-    """Folder of the map's images; None is the original one."""
+    """Folder of the map's images; None is the one from which they were indexed."""
     map_depth: str | os.PathLike[str] | None = None
     """Folder of depth for the map's images: 16-bit PNGs in millimetres under the images' names,
     0 where unknown. Answers with depth have a translation in metres."""
     min_inliers: int | None = None
-    """Minimum inliers of the best answer: with fewer the place is unknown. None is the map's
-    calibration, if any."""
+    """Minimum number of inliers of the best answer; with fewer, the place counts as unknown. None
+    takes the number from the map's calibration, if any."""
 
     def __post_init__(self) -> None:
         """Check the numbers, and that the folders exist."""
@@ -103,13 +103,13 @@ class _View(NamedTuple):
 
 
 class Verifier:
-    """Matches queries with images of a map, and caches the features of the latter."""
+    """Matches queries with images of a map, whose features it caches."""
 
     def __init__(self, verify: Verify) -> None:
         """Open the matcher.
 
         Raises:
-            InputError: what `open_matcher` raises.
+            InputError: the matcher's file does not exist, or is a program of another kind.
         """
         self.verify = verify
         self._matcher = open_matcher(verify.matcher)
@@ -128,15 +128,15 @@ class Verifier:
         """Verify the answers to a query.
 
         Args:
-            image: the query, of any type that `as_rgb` takes.
-            names: folder and name of the answers' images.
+            image: pixels of the query: 8-bit RGB, or another type that `as_rgb` converts.
+            names: (folder, name) of each answer's image.
 
         Returns:
-            The verification of each; without matches if its image cannot be read.
+            The verification of each answer; without matches if its image cannot be read.
 
         Raises:
-            InputError: none of them can be read, intrinsics for another image size, or depth in
-                another format.
+            InputError: no answer's image can be read, the intrinsics are for another image size, or
+                a depth image has another format.
         """
         query = self._view(as_rgb(image, "contrast-stretch"), "the query")
         checks, lost = [], []
@@ -162,20 +162,20 @@ class Verifier:
         positions: Sequence[Any],
         size: tuple[int, int],
     ) -> tuple[MapPose, int, Float64[np.ndarray, " 3"]] | None:
-        """Compute where the query's camera was, from the first two answers that allow it.
+        """Compute where the query's camera was, from the first two answers that allow it, or None.
 
         With depth, these are two answers with a translation. Otherwise, matches between two answers
         at a known distance give the depth of points, and PnP gives the pose of the query's camera.
 
         Args:
-            checks: from `check`.
-            names: as `check` takes them.
-            positions: positions of the answers, in metres east and north; None if unknown.
-            size: height and width of the query.
+            checks: verifications of the answers, from `check`.
+            names: (folder, name) of each answer's image.
+            positions: position of each answer, in metres east and north; None if unknown.
+            size: height and width of the query in pixels.
 
         Returns:
             The pose in metres east and north, the index of the answer that it was computed from,
-            and the metres from that answer's camera, as in `Verification.translation`.
+            and the vector from that answer's camera, as in `Verification.translation`.
         """
         pairs = enumerate(zip(checks, positions, strict=True))
         known = [n for n, (check, at) in pairs if check.rotation is not None and at is not None]
@@ -299,11 +299,11 @@ def _by_depth(first: Verification, second: Verification) -> tuple[Pose, np.ndarr
 def order_by_inliers(
     similarities: Float[np.ndarray, " n"], inliers: Int[np.ndarray, " n"] | Sequence[int]
 ) -> Int64[np.ndarray, " n"]:
-    """Return the order of verified answers, best first.
+    """Return the order of verified answers, as indices, best first.
 
-    An inlier counts as a similarity of 0.002, and at most 50 count: up to 0.1. Ranking only by
-    inliers is worse than ranking only by similarity where few local features match, as between
-    seasons (docs/verification.md has the figures).
+    Each inlier adds 0.002 to the similarity, for at most 50 inliers: 0.1. Ranking only by inliers
+    is worse than ranking only by similarity where few local features match, as between seasons
+    (docs/verification.md has the figures).
     """
     scores = similarities + _INLIER * np.minimum(inliers, _MOST_INLIERS)
     return np.argsort(-scores, kind="stable")

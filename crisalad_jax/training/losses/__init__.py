@@ -1,6 +1,6 @@
 """Losses on the descriptors of a batch, and the miner that chooses which pairs enter them.
 
-Where pytorch-metric-learning has the same loss, the values are equal on unit descriptors.
+A loss that pytorch-metric-learning also has gives the same values on unit descriptors.
 """
 
 import importlib

@@ -22,7 +22,7 @@ Similarities = Float[Array, "anchor image"]
 
 @brief
 class Pairs(NamedTuple):
-    """The pairs (anchor, other) that enter the loss."""
+    """Masks of the pairs that enter the loss: a row for each anchor, a column for each image."""
 
     positives: Bool[Array, "anchor image"]
     negatives: Bool[Array, "anchor image"]
@@ -38,15 +38,15 @@ class LossBatch:
     labels: Int[Array, " image"]
     """Place, or class, of each image."""
     valid: Bool[Array, " image"]
-    """Whether an image takes part; the others are neither anchors nor in pairs."""
+    """Whether each image takes part; the others are not in any pair, even as anchors."""
     pairs: Pairs
-    """Pairs that the miner chose."""
+    """Pairs that the miner chose; without a miner, all pairs."""
     classes: Int[Array, ""] | int | None = None
     """Number of classes, if the loss has a vector for each."""
     tokens: Float[Array, "image token dim"] | None = None
-    """The field of `Tokens` that the loss's `reads_tokens` names."""
+    """The images' local or dense tokens, as the loss's `reads_tokens` says; else None."""
     targets: Float[Array, "image target"] | None = None
-    """A teacher's unit descriptors of the images, for a loss that `reads_targets`."""
+    """A teacher's unit descriptors of the images, for a loss whose `reads_targets` is True."""
 
     @functools.cached_property
     def similarities(self) -> Similarities:
@@ -62,7 +62,7 @@ class LossBatch:
 
     @property
     def anchors(self) -> Int[Array, ""]:
-        """Number of valid images, at least 1."""
+        """Number of valid images, as a divisor: 1 if there are none."""
         return jnp.maximum(self.valid.sum(), 1)
 
 
@@ -72,7 +72,7 @@ class LossValue(NamedTuple):
 
     loss: Float[Array, ""]
     accuracy: Float[Array, ""] | None = None
-    """Accuracy, if the loss classifies."""
+    """Share of the images whose nearest class is their own, if the loss classifies; else None."""
     numbers: Mapping[str, Any] | None = None
     """Other scalars by name, such as a learnt temperature; each step logs them as `loss.NAME`."""
 
@@ -80,8 +80,8 @@ class LossValue(NamedTuple):
 class Loss(Part, abc.ABC):
     """A loss of a batch: a frozen dataclass whose fields are its constants.
 
-    Only `apply` is required. A plain function of a `LossBatch` that returns a number is a loss
-    without constants.
+    A subclass has to define only `apply`. A plain function that takes a `LossBatch` and returns a
+    scalar can be registered too, as a loss without constants.
 
     Example:
         >>> from crisalad_jax import LossConfig, metric_loss, register_loss
@@ -97,18 +97,18 @@ class Loss(Part, abc.ABC):
     """Whether the loss ranks all images, so that no miner may choose pairs."""
 
     of_tuples: ClassVar[bool] = False
-    """Whether the loss takes only mined tuples, whose pairs all contain the query."""
+    """Whether the loss takes only mined tuples, in which the query is the anchor of every pair."""
     learning_rate = 1e-2  # without a type, so that a subclass can make it a field
     """Learning rate of the loss's own parameters, which have their own Adam optimiser."""
 
     grouping: ClassVar[ClassesConfig | None] = None
     """Grouping of images into classes; None for a loss of pairs of images."""
     reads_tokens: ClassVar[Literal["local", "dense"] | None] = None
-    """Field of `Tokens` that the loss also compares: the aggregator's local tokens, or local
-    features, which few aggregators provide in training."""
+    """Field of `Tokens` that the loss compares, in addition to descriptors: "local", the
+    aggregator's local tokens, or "dense", local features, which few aggregators provide."""
 
     reads_targets: ClassVar[bool] = False
-    """Whether the loss compares descriptors with a teacher's; then images need no places."""
+    """Whether the loss compares descriptors with a teacher's; images then need no places."""
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Any:
         """Return the loss's own trainable parameters, a pytree of arrays; by default None.
@@ -116,7 +116,7 @@ class Loss(Part, abc.ABC):
         Args:
             key: random key.
             classes: number of classes; 0 for a loss of pairs.
-            dim: width of a descriptor.
+            dim: number of dimensions of a descriptor.
         """
         return None
 
@@ -125,12 +125,12 @@ class Loss(Part, abc.ABC):
         return self
 
     def with_grouping(self, grouping: ClassesConfig) -> "Loss":
-        """Return the loss with other classes of images; unchanged by default."""
+        """Return the loss with another grouping of images into classes; unchanged by default."""
         return self
 
     @abc.abstractmethod
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Return the loss of a batch; `params` come from `init`."""
+        """Compute the loss of a batch; `params` are the loss's own parameters (`init`), or None."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,10 +139,10 @@ class GivenLoss(Loss):
 
     part_name: ClassVar[str] = "given"
     function: Callable[..., Any]
-    """Takes a batch; or descriptors, labels and, optionally, which images are valid."""
+    """Takes a `LossBatch`, or (descriptors, labels) or (descriptors, labels, valid)."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Return the function's loss."""
+        """Call the function, and return its value as a `LossValue`."""
         arrays = batch.descriptors, batch.labels, batch.valid
         count = count_arguments(self.function, "descriptors", "labels", "valid")
         value = self.function(batch) if count == 1 else self.function(*arrays[:count])
@@ -157,7 +157,7 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
 
 
 def check_value(value: Any, name: str) -> None:
-    """Check that a loss has returned scalars, in float32 or float64; `name` is for messages."""
+    """Raise InputError, naming the loss, unless it returned float32 or float64 scalars."""
     dtype = getattr(getattr(value, "loss", None), "dtype", None)
     number: Any = jax.ShapeDtypeStruct((), jnp.float64 if dtype == jnp.float64 else jnp.float32)
     has_accuracy = getattr(value, "accuracy", None) is not None
@@ -184,7 +184,7 @@ def mean_of_positive(losses: Float[Array, "*shape"]) -> Float[Array, ""]:
 
 
 def log_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Array, " anchor"]:
-    """Compute log(sum of exp(x)) over the chosen entries; 0, with a finite gradient, if none is."""
+    """Compute log(sum(exp(x))) over each row's `where`; an empty row is 0, with finite gradient."""
     some = where.any(axis=1, keepdims=True)
     # A row without chosen entries sums all of them, to a finite number that is not used.
     chosen = jnp.where(where | ~some, x, -jnp.inf)
@@ -192,7 +192,7 @@ def log_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Ar
 
 
 def log1p_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Array, " anchor"]:
-    """Compute log(1 + sum of exp(x) over the chosen entries), with a stable gradient."""
+    """Compute log(1 + sum(exp(x))) over each row's `where`, with a stable gradient."""
     chosen = jnp.where(where, x, -jnp.inf)
     # A column of zeros adds the 1 inside the logarithm, and keeps an empty row finite.
     return jax.nn.logsumexp(jnp.pad(chosen, ((0, 0), (0, 1))), axis=1)

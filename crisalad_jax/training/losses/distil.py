@@ -21,15 +21,15 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 
 @LOSSES.register("distil")
 class DistilConfig(Loss):
-    """Distillation from a teacher's descriptors, possibly longer ones, of the same images.
+    """Distillation from a teacher's descriptors of the same images, which may be longer.
 
-    The loss is a weighted sum of four terms; a term of weight 0 is not computed. Only `labels`
-    uses the images' places.
+    The loss is the weighted sum of `cosine`, `relations`, `neighbours` and `labels`; a term of
+    weight 0 is not computed. Only `labels` uses the images' places.
     """
 
     reads_targets: ClassVar[bool] = True
     learning_rate: PositiveFloat = 1e-3
-    """Learning rate of the projection."""
+    """Learning rate of the projection to the teacher's descriptor length."""
     teacher_dim: PositiveInt = 8448
     """Dimensions of the teacher's descriptor; `crisalad distil` sets it."""
     cosine: NonNegativeFloat = 1.0
@@ -42,7 +42,7 @@ class DistilConfig(Loss):
     """Weight of the KL divergence between the teacher's and the student's softmax of an image's
     similarities to the rest of the batch (as in Passalis and Tefas, ECCV 2018)."""
     temperature: PositiveFloat = 0.05
-    """Temperature of both softmaxes."""
+    """Temperature of both softmaxes of `neighbours`."""
     labels: NonNegativeFloat = 0.0
     """Weight of the multi-similarity loss of the images' places."""
 
@@ -52,11 +52,11 @@ class DistilConfig(Loss):
         require_field(self, "cosine", weights > 0, "above 0, or another term's weight")
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Linear | None:
-        """Draw the projection to the teacher's descriptor length."""
+        """Draw the projection to the teacher's descriptor length; None if `cosine` is 0."""
         return init_linear(key, dim, self.teacher_dim) if self.cosine else None
 
     def apply(self, params: Linear | None, batch: LossBatch) -> LossValue:
-        """Compute the weighted sum; each term is logged unweighted."""
+        """Compute the weighted sum of the terms, which are logged without their weights."""
         shape = len(batch.labels), self.teacher_dim
         assert batch.targets is not None  # `metric_loss` checks it
         found = batch.targets.shape

@@ -1,4 +1,4 @@
-"""Triplets of Sinkhorn divergences between the local tokens of images."""
+"""Triplet loss of Sinkhorn divergences between the local tokens of images."""
 
 import dataclasses
 from typing import Any, ClassVar, Literal
@@ -15,12 +15,12 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 
 @LOSSES.register("sinkhorn-divergence")
 class SinkhornDivergenceLoss(MultiSimilarityConfig):
-    """Multi-similarity loss of the descriptors, and a triplet loss of the images' local tokens.
+    """Multi-similarity loss of the descriptors plus a triplet loss of the images' local tokens.
 
-    Distances in a triplet are Sinkhorn divergences (Feydy et al., AISTATS 2019) between the unit
-    local tokens of two images, all of the same mass, with squared Euclidean costs. From the pairs
-    that the miner chose, an anchor's triplet takes its least similar positive and its most similar
-    negative, by the descriptors (Hermans et al. 2017). Both mean divergences are logged.
+    Distances in a triplet are Sinkhorn divergences (Feydy et al., AISTATS 2019) between two images'
+    local tokens: unit vectors of equal mass, with squared Euclidean costs. From the pairs that the
+    miner chose, an anchor's triplet takes the positive with the least similar descriptor and the
+    negative with the most similar (Hermans et al. 2017). The mean divergences to both are logged.
     """
 
     reads_tokens: ClassVar[Literal["local", "dense"]] = "local"
@@ -30,14 +30,14 @@ class SinkhornDivergenceLoss(MultiSimilarityConfig):
     margin: PositiveFloat = 0.1
     """Divergence by which a positive must be nearer than a negative."""
     epsilon: PositiveFloat = 0.1
-    """Entropic regularisation, in units of the costs, which are 0 to 4."""
+    """Entropic regularisation, in units of the costs, which range from 0 to 4."""
 
     def from_scratch(self) -> Loss:
         """Return the loss with base 0.5, as for the multi-similarity loss."""
         return dataclasses.replace(self, base=0.5)
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Add the mean violation of the margin over the anchors that have both kinds of pairs."""
+        """Add the weighted triplet loss, averaged over anchors with a positive and a negative."""
         assert batch.tokens is not None
         # Images that take no part may be NaN.
         tokens = l2_normalise(jnp.where(batch.valid[:, None, None], batch.tokens, 0))

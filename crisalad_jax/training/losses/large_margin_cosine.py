@@ -14,7 +14,7 @@ from crisalad_jax.training.losses.base import LOSSES, Loss, LossBatch, LossValue
 
 @LOSSES.register("large-margin-cosine")
 class LargeMarginCosineConfig(Loss):
-    """Large-margin cosine loss (CosFace, Wang et al., CVPR 2018) over groups of classes.
+    """Large-margin cosine loss (CosFace, Wang et al., CVPR 2018), one group of classes per epoch.
 
     The constants are CosPlace's (Berton et al., CVPR 2022); see docs/methods.md.
     """
@@ -24,7 +24,7 @@ class LargeMarginCosineConfig(Loss):
     margin: Fraction = 0.4
     """Margin subtracted from the cosine of an image's own class."""
     learning_rate: PositiveFloat = 0.01
-    """Learning rate of the classifiers, which have their own Adam, without decay."""
+    """Constant learning rate of the class vectors, whose own Adam optimiser has no weight decay."""
     classes: ClassesConfig = ClassesConfig()
     """Grouping of images into classes."""
 
@@ -34,11 +34,11 @@ class LargeMarginCosineConfig(Loss):
         return self.classes
 
     def with_grouping(self, grouping: ClassesConfig) -> Loss:
-        """Return the loss over other classes."""
+        """Return the loss with another grouping of images into classes."""
         return dataclasses.replace(self, classes=grouping)
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Float[Array, "class dim"]:
-        """Draw vectors for the classes (Glorot and Bengio 2010, uniform, as in CosPlace)."""
+        """Draw a vector for each class (uniform, Glorot and Bengio 2010, as in CosPlace)."""
         bound = jnp.sqrt(6 / (jnp.asarray(classes, jnp.float32) + dim))
         return bound * jax.random.uniform(key, (classes, dim), jnp.float32, -1, 1)
 
@@ -46,12 +46,12 @@ class LargeMarginCosineConfig(Loss):
         """Compute the cross entropy of cosines to class vectors (CosFace, equation 4).
 
         The margin is subtracted from the cosine of an image and its own class, then all cosines are
-        multiplied by the scale. The means are over the valid images; the accuracy is the share
-        whose nearest class is their own. Only directions matter.
+        multiplied by the scale. The loss is the mean over the valid images; the accuracy is the
+        share of them whose nearest class is their own. All vectors are first scaled to length 1.
 
         Args:
-            params: a vector for each class; those beyond `batch.classes` are padding.
-            batch: its labels are classes.
+            params: a row for each class; rows beyond `batch.classes` are padding.
+            batch: a batch whose labels are classes.
         """
         directions, centres = _directions(batch.descriptors), _directions(params)
         cosines = jnp.matmul(directions, centres.T, precision="highest")

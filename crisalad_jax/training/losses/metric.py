@@ -35,8 +35,8 @@ class LossConfig:
     miner_margin: NonNegativeFloat = 0.1
     """Similarity margin of the miner, epsilon in its paper."""
     pml_compat: bool = False
-    """Whether the loss is 0, as in pytorch-metric-learning, for a batch with at most one positive
-    and at most one negative pair (its triplet loss differs)."""
+    """Whether the loss is 0 for a batch with at most one positive and at most one negative pair, as
+    in pytorch-metric-learning (except its triplet loss)."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -81,8 +81,8 @@ def metric_loss(
         config: the loss, its miner and their constants.
         valid: images that take part; None means all. The others are in no pairs.
         params: the loss's own trainable parameters (`Loss.init`).
-        classes: number of classes, if `params` have a vector for each, followed by padding.
-        pairs: the pairs to choose from, such as `tuple_pairs`; None means `all_pairs`.
+        classes: number of classes, if `params` has a vector for each; further vectors are padding.
+        pairs: the pairs to choose from, such as those of `tuple_pairs`; None means all pairs.
         tokens: local tokens or features of each image, for a loss that compares them.
         targets: a teacher's unit descriptors of the images, for a loss that compares them.
 
@@ -90,8 +90,8 @@ def metric_loss(
         The loss and its logged values.
 
     Raises:
-        InputError: a loss returns something other than a number, or its parameters, local features,
-            tuples or targets are missing.
+        InputError: shapes do not fit; the loss returns something other than a number; or its
+            parameters, tokens, tuples or targets are missing.
 
     Example:
         >>> import jax.numpy as jnp

@@ -10,14 +10,14 @@ from crisalad_jax.training.losses.base import Pairs, Similarities
 
 
 def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None) -> Pairs:
-    """Find all pairs of `valid` images: from the same place, and from two places.
+    """Find all positive (same place) and negative (two places) pairs of valid images.
 
     Args:
         labels: the place of each image.
         valid: images that take part; None means all.
 
     Returns:
-        The positive and the negative pairs.
+        The positive and the negative pairs; an image is not paired with itself.
 
     Example:
         >>> import jax.numpy as jnp
@@ -30,17 +30,17 @@ def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | No
 
 
 def mine(similarities: Similarities, pairs: Pairs, *, margin: float) -> Pairs:
-    """Choose the pairs that violate the order within their row, or meet it by less than `margin`.
+    """Choose each anchor's hard pairs, as in the multi-similarity loss (Wang et al., CVPR 2019).
 
-    The miner of the multi-similarity loss (Wang et al., CVPR 2019). A positive is chosen if it is
-    strictly less similar than the hardest negative plus the margin, a negative if it is strictly
-    more similar than the hardest positive minus the margin. An anchor without positives or without
-    negatives gets no pairs.
+    A positive is chosen if its similarity to the anchor is strictly below that of the most similar
+    negative plus the margin; a negative, if its similarity is strictly above that of the least
+    similar positive minus the margin. An anchor without positives or without negatives gets no
+    pairs.
 
     Args:
-        similarities: similarities of all images.
+        similarities: similarity of every anchor (row) and image (column).
         pairs: the pairs to choose from.
-        margin: epsilon of the paper.
+        margin: similarity margin, epsilon in the paper.
 
     Returns:
         The chosen pairs.
@@ -78,7 +78,7 @@ def tuple_labels(roles: Int[np.ndarray, "tuple image"]) -> Int[np.ndarray, "tupl
         roles: a `Role` for each image of each tuple.
 
     Returns:
-        The labels.
+        The labels, in the same shape: 4 times the number of the tuple, plus the role.
 
     Example:
         >>> import numpy as np
@@ -91,14 +91,14 @@ def tuple_labels(roles: Int[np.ndarray, "tuple image"]) -> Int[np.ndarray, "tupl
 def tuple_pairs(
     labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None
 ) -> Pairs:
-    """Find the pairs of each tuple, whose anchor is its query.
+    """Find the pairs of each mined tuple, whose only anchor is its query.
 
     Args:
         labels: the labels from `tuple_labels`.
         valid: images that take part; None means all.
 
     Returns:
-        The positive and the negative pairs; only queries' rows have any.
+        The positive and the negative pairs; only the rows of queries have any.
 
     Example:
         >>> import jax.numpy as jnp

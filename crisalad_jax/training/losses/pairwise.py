@@ -23,12 +23,14 @@ class MultiSimilarityConfig(Loss):
     """Multi-similarity loss (Wang et al., CVPR 2019) with the constants of GSV-Cities."""
 
     alpha: PositiveFloat = 1.0
+    """Scale of the positives' similarities, the paper's alpha."""
     beta: PositiveFloat = 50.0
+    """Scale of the negatives' similarities, the paper's beta."""
     base: float = 0.0
-    """Similarity around which pairs are weighted. From random weights 0.5 learns where 0 fails."""
+    """Similarity around which pairs are weighted. From random weights, 0.5 learns but 0 fails."""
 
     def from_scratch(self) -> Loss:
-        """Use base 0.5: from random weights, base 0 drives all similarities to 0 together."""
+        """Return the default loss with base 0.5: base 0 would drive all similarities to 0."""
         return MultiSimilarityConfig(base=0.5)
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
@@ -52,7 +54,7 @@ class ContrastiveConfig(Loss):
     """Distance from which a pair of two places costs nothing."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Average the violations of each margin, without the squares of the paper."""
+        """Add the mean violations of the two margins; unlike in the paper, they are not squared."""
         distances = batch.distances
         near = jnp.where(batch.pairs.positives, distances - self.positive_margin, 0)
         far = jnp.where(batch.pairs.negatives, self.negative_margin - distances, 0)
@@ -69,10 +71,10 @@ class TripletConfig(Loss):
     """Triplets to average over: those that violate the margin, or all (NetVLAD's code)."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Average the violations of the margin over triplets of distances.
+        """Average the violations of the margin over triplets, without a cubic array of triplets.
 
-        No cubic array of triplets is made. With an anchor's negatives sorted, those that violate
-        the margin with a positive come first, so that their sum is a prefix sum.
+        With an anchor's negatives sorted by distance, those that violate the margin with a positive
+        come first, so that their sum is a prefix sum.
         """
         distances = batch.distances
         ordered = jnp.sort(jnp.where(batch.pairs.negatives, distances, jnp.inf), axis=1)
@@ -95,9 +97,10 @@ class SupConConfig(Loss):
     """Supervised contrastive loss (Khosla et al., NeurIPS 2020) with GSV-Cities' temperature."""
 
     temperature: PositiveFloat = 0.07
+    """Divisor of the similarities."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Compute the cross entropy of each positive among all pairs (L_out of the paper)."""
+        """Compute the cross entropy of positives among their anchor's pairs (the paper's L_out)."""
         logits = batch.similarities / self.temperature
         positives, negatives = batch.pairs
         log_share = logits - log_sum_exp(logits, positives | negatives)[:, None]
@@ -118,7 +121,7 @@ class CircleConfig(Loss):
     """Scale of the similarities, the paper's gamma."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Weight each similarity by its distance from its optimum."""
+        """Compute the loss, with each similarity weighted by its distance from its optimum."""
         margin, scale = self.margin, self.scale
         fixed = jax.lax.stop_gradient(batch.similarities)
         pull = -scale * jax.nn.relu(1 + margin - fixed) * (batch.similarities - (1 - margin))
@@ -161,7 +164,7 @@ class FastAPConfig(Loss):
 
 @LOSSES.register("selavpr")
 class SelaVprLoss(Loss):
-    """The loss of Lu et al. (ICLR 2024), with a margin of 0 for local features."""
+    """SelaVPR's loss (Lu et al., ICLR 2024), with a margin of 0 for local features."""
 
     of_tuples: ClassVar[bool] = True
     reads_tokens: ClassVar[Literal["local", "dense"]] = "dense"
@@ -170,7 +173,7 @@ class SelaVprLoss(Loss):
     """Distance by which a positive's descriptor must be nearer than a negative's."""
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Add the mean triplet losses of descriptors and of local similarities."""
+        """Compute the sum of the mean triplet losses of descriptors and of local similarities."""
         assert batch.tokens is not None
         dense = batch.tokens
         positives, negatives = batch.pairs
@@ -191,14 +194,11 @@ class SelaVprLoss(Loss):
 def mutual_similarity(
     first: Float[Array, "first dim"], second: Float[Array, "second dim"]
 ) -> Float[Array, ""]:
-    """Average the inner products of features that are mutual nearest neighbours.
+    """Average the inner products of mutual nearest neighbours; there is always at least one pair.
 
     Args:
         first: unit features of an image.
-        second: unit features of another.
-
-    Returns:
-        The mean; there is always at least one such pair of features.
+        second: unit features of another image.
 
     Example:
         >>> float(mutual_similarity(jnp.eye(3)[:2], jnp.eye(3)[1:]))

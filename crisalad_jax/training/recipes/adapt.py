@@ -9,12 +9,12 @@ from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD
 CHANGES = LightAugmentConfig(
     crop=0.3, shift=0.1, rotation=5, blur=1.5, colour=0.4, gamma=0.4, illumination=0.6
 )
-"""Simulates another day: a map's own images show each place in one light only."""
+"""Augmentation that simulates another day: a map's images show each place in one light only."""
 
 
 @register_recipe("adapt")
 def adapt(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of `crisalad adapt`: two views of each of 32 places.
+    """Make the recipe of `crisalad adapt`: batches of two views of each of 32 places.
 
     The adapters and the head train, or only the head if the model has no adapters.
     """

@@ -22,8 +22,8 @@ from crisalad_jax.utils.output import warn
 Make = Callable[[ModelConfig, str], TrainConfig]
 """Takes the model of a preset and the preset's name; returns the configuration."""
 RECIPES: dict[str, Make] = {}
-"""Recipes by name. A published method's name stands for its original training. Rows of Table 2 that
-are missing here differ from `crisalad` by one flag."""
+"""Recipes by name. A published method's name stands for its original training. Rows of the paper's
+Table 2 that have no recipe differ from `crisalad` by one flag."""
 
 
 def register_recipe(name: str) -> Callable[[Make], Make]:
@@ -65,9 +65,9 @@ def recipe(
         name: name of the recipe (`RECIPES`), or RECIPE+PART: a recipe with a registered part, as
             NAME or KIND:NAME, in place of its own. PART by itself means crisalad+PART. None is the
             paper's recipe or, for preset `tiny`, `scratch`.
-        model: the model of the weights to start from, in place of the preset's and the recipe's. It
-            is trained and validated at its own image size. If the recipe trains adapters and the
-            model has none, only its head trains.
+        model: configuration of the model to start from, in place of the preset's and the recipe's.
+            It is trained and validated at its own image size. If the recipe trains adapters and
+            the model has none, only its head trains.
 
     Returns:
         The configuration of a training run.
@@ -117,9 +117,9 @@ def model_of(
 ) -> ModelConfig:
     """Make the model of a published method, without a cross-image encoder.
 
-    Training images are resized as `PreprocessingConfig.for_training` says, whatever is set here. A
-    model that normalises by local contrast, such as `tiny`, takes only the filter, because it is
-    not a published model.
+    Training images are resized as `PreprocessingConfig.for_training` says, whatever is set here.
+    For a preset that normalises by local contrast, such as `tiny`, only `filter` of
+    `preprocessing` is used, because that preset is not a published model.
 
     Args:
         model: the preset's model.
@@ -127,9 +127,9 @@ def model_of(
         backbone: the method's backbone.
         aggregator: name of the head, made in the preset's size; None keeps the model's.
         head: settings of the head that differ from the preset's.
-        image_size: height and width for a convolutional backbone, which for `tiny` is a small
-            ResNet at its own image size; None is the preset's.
-        compute_dtype: see `ModelConfig`.
+        image_size: height and width for a convolutional backbone, which preset `tiny` replaces with
+            a small ResNet at the preset's image size; None is the preset's size.
+        compute_dtype: type of the matrix products; see `ModelConfig`.
         **preprocessing: how photographs are resized, as fields of `PreprocessingConfig`.
 
     Example:
@@ -157,7 +157,7 @@ def model_of(
 
 
 def validation_size(preset: str, side: int) -> tuple[int, int] | None:
-    """Return the image size at which a method's code validates; None for preset tiny."""
+    """Return (side, side), the image size for validation; for tiny None, the model's own size."""
     return None if preset == "tiny" else (side, side)
 
 
@@ -183,7 +183,7 @@ def mines_tuples(name: str) -> bool:
 
 
 def mixes_sets(name: str) -> bool:
-    """Return whether a name belongs to a recipe that trains on a mixture of sets."""
+    """Return whether a name belongs to a recipe that trains on a mixture of training sets."""
     return name in RECIPES and bool(recipe("b14", name).mixture)
 
 
@@ -194,15 +194,15 @@ def find_part(
 
     Args:
         name: the part's name, or KIND:NAME if several kinds have a part of that name.
-        preset: the size of the model, which is also that of the part.
+        preset: the size of the model, for which the part is made.
         what: what messages call the name.
-        others: names that are accepted instead of a part's, for messages.
+        others: other names that the caller accepts, which messages list.
 
     Returns:
         The part.
 
     Raises:
-        InputError: no such part, or several.
+        InputError: there is no such part, or several kinds have one.
 
     Example:
         >>> find_part("step:newton", "b14").part_name
@@ -234,14 +234,14 @@ _KINDS = (
 
 
 def with_part(config: TrainConfig, part: Any) -> TrainConfig:
-    """Replace a recipe's part with another of the same kind, and leave the rest as it is.
+    """Replace the part of a recipe that is of the same kind as `part`; leave the rest as it is.
 
-    A model with another aggregator has no cross-image encoder: its descriptors are single-image.
+    With a new aggregator, the model has no cross-image encoder: its descriptors are single-image.
     CriSALAD's backbone stays frozen, with the same adapters, so that methods differ only in how
     they use its features. A new adapter trains together with the head, unless everything trains.
 
     Raises:
-        InputError: the part does not fit, or the recipe has no place for it.
+        InputError: the part does not fit, or the recipe's model has no place for such a part.
     """
     kind, model = part.registry.kind, config.model
     if kind == "augmentation":
@@ -301,9 +301,9 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
     """Change a recipe so that its model trains from random weights, like recipe `scratch`.
 
     The recipe's model and kind of loss stay, because they define its method. The optimiser, the
-    loss's constants, the augmentation and the batches are those of `scratch`, in float32. The whole
-    model trains. A plug-in's augmentation stays, and so do batches of mined tuples and of a mixture
-    of sets.
+    loss's constants, the augmentation and the batches are those of `scratch`. The whole model
+    trains, in float32. A plug-in's augmentation stays, and so do batches of mined tuples and of a
+    mixture of sets.
 
     Args:
         config: the recipe.

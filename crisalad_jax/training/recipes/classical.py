@@ -1,4 +1,4 @@
-"""Visual words of hand-crafted features: the only training is `with_vocabulary`."""
+"""Recipes of visual words of hand-crafted features, which only `with_vocabulary` trains."""
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS

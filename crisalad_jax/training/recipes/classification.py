@@ -1,6 +1,6 @@
 """CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023): classification of places.
 
-Over ResNet they follow the published code; over our ViT, the paper's comparison.
+The recipes over ResNet follow the published code; those over a ViT, our paper's comparison.
 """
 
 import dataclasses
@@ -61,8 +61,8 @@ def _over_resnet(
 def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
     """Make CosPlace's recipe, from gmberton/CosPlace: its defaults, ResNet-18 and 512 dimensions.
 
-    Classes are cells of position and heading: they need headings (column `northdeg`), and many
-    images of a spot, as in San Francisco XL. Images are described at their native sizes.
+    Classes are cells of position and heading, so the data need headings (column `northdeg`) and
+    many images of a spot, as in San Francisco XL. Images are described at their native sizes.
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(kind="cells", steps=10_000))
     return _over_resnet(model, preset, loss, "float32", min_images=10, epochs=50)
@@ -72,19 +72,19 @@ def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
 def eigenplaces_turns(model: ModelConfig, preset: str) -> TrainConfig:
     """Make EigenPlaces' recipe, from gmberton/EigenPlaces, with two differences.
 
-    A step of its code takes one batch of lateral and one of frontal classes; here they alternate by
-    epoch, over twice as many epochs. Its code crops images from panoramas, towards the focal point;
-    here photographs keep their own headings.
+    A step of that code takes a batch of lateral and a batch of frontal classes; here the two kinds
+    alternate by epoch, over twice as many epochs. That code crops images from panoramas, towards
+    the focal point of a class; here photographs keep their own headings.
     """
     return _over_resnet(model, preset, _VIEWPOINTS, "bfloat16", min_images=5, epochs=80)
 
 
 @register_recipe("cosplace-vit")
 def cosplace_vit(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make CosPlace's recipe for our ViT, whose adapters and head train.
+    """Make CosPlace's recipe for the preset's ViT, whose adapters and head train.
 
-    Images have the ViT's size, and RandAugment. The classes are GSV-Cities' places, because each of
-    them is one spot in one direction.
+    Images have the ViT's size, and RandAugment changes them. The classes are GSV-Cities' places,
+    because each of them is one spot in one direction.
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(steps=10_000))
     head = AGGREGATORS.make("cosplace", preset)
@@ -93,9 +93,9 @@ def cosplace_vit(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("eigenplaces-vit")
 def eigenplaces_vit(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make EigenPlaces' recipe for our ViT: viewpoint classes, longer descriptors.
+    """Make EigenPlaces' recipe for the preset's ViT: like CosPlace's, with viewpoint classes.
 
-    As in `eigenplaces_turns`, lateral and frontal classes alternate by epoch.
+    Lateral and frontal classes alternate by epoch; descriptors are 4 times as long as CosPlace's.
     """
     head: Any = AGGREGATORS.make("cosplace", preset)
     head = dataclasses.replace(head, dim=4 * head.dim)

@@ -41,8 +41,8 @@ def mixvpr(model: ModelConfig, preset: str) -> TrainConfig:
 def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
     """Make Conv-AP's recipe, from amaralibey/gsv-cities: ResNet-50, whose last two stages train.
 
-    The head and the bicubic filter are those of its model with 4,096 dimensions. The optimiser that
-    its code calls Adam is AdamW.
+    The head and the bicubic filter are those of the published model with 4,096 dimensions. The
+    optimiser that the code calls Adam is AdamW.
     """
     return TrainConfig(
         model=model_of(
@@ -87,9 +87,9 @@ def boq_resnet50(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("starter")
 def starter(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of `starter`'s second run, on 24,000 places (`render --scenes 6000`).
+    """Make the recipe of the second run of `starter`, on 24,000 places (`render --scenes 6000`).
 
-    It started from the weights of an earlier run on smaller images; see docs/starter.md.
+    That run started from the weights of an earlier one on smaller images; see docs/starter.md.
     """
     whole = model_of(
         *(model, preset, ResNetConfig(layers=18, stages=3, width=48), "conv-ap"),

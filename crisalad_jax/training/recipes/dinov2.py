@@ -1,7 +1,7 @@
-"""Recipes over DINOv2, each as its authors' code trains it.
+"""Recipes over DINOv2, as the authors' code trains it, where that is published.
 
-Only CricaVPR's has a cross-image encoder. If a method's code validates at a larger size, so does
-its recipe, except for preset tiny, which validates at the model's.
+Only CricaVPR's has a cross-image encoder. If a method's code validates at a larger image size than
+it trains at, so does its recipe, except for preset tiny, which validates at the training size.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from crisalad_jax.training.schedules import MilestonesSchedule, StepSchedule
 from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD
 
 ADAM_STEP = OptimiserConfig(kind="adam", learning_rate=5e-5, schedule="step", weight_decay=0.0)
-"""From CricaVPR's code and the code derived from it."""
+"""Optimiser of CricaVPR's code and of the code derived from it."""
 BOQ_TRAINING: dict[str, Any] = {
     "optimiser": OptimiserConfig(
         learning_rate=1e-4,
@@ -45,7 +45,7 @@ MIXVPR_OPTIMISER = OptimiserConfig(
     warmup_steps=650,
     weight_decay=1e-3,
 )
-"""From amaralibey/MixVPR, for 120 places."""
+"""Optimiser of amaralibey/MixVPR, for batches of 120 places."""
 
 
 _HALF_FLOATS: dict[str, Any] = {
@@ -71,10 +71,10 @@ def anyloc(model: ModelConfig, preset: str) -> TrainConfig:
 def salad(model: ModelConfig, preset: str) -> TrainConfig:
     """Make SALAD's recipe, from serizba/salad (Izquierdo and Civera, CVPR 2024).
 
-    There is no adapter or encoder; the last four blocks train in mixed precision.
+    There is no adapter or cross-image encoder; the last four blocks train in mixed precision.
 
-    Its code also advances the schedule by one step at the end of each epoch. This is left out: it
-    lowers the learning rate by less than 1 part in 1,000.
+    SALAD's code also advances the schedule by one step at the end of each epoch. That is left out:
+    it lowers the learning rate by less than 1 part in 1,000.
     """
     return TrainConfig(
         model=model_of(model, preset, _vit(model), None, compute_dtype="bfloat16"),
@@ -92,8 +92,8 @@ def vlad_buff(model: ModelConfig, preset: str) -> TrainConfig:
     """Make VLAD-BuFF's recipe, from Ahmedest61/VLAD-BuFF (Khaliq et al., ECCV 2024).
 
     It is SALAD's training with another head, which starts from principal components and centroids
-    of 500 training images. The code uses images of London for these; its published weights are
-    those of the last epoch.
+    of 500 training images. The authors' code takes images of London instead; its published weights
+    are those of the last epoch.
     """
     whole = model_of(model, preset, _vit(model), "vlad-buff", compute_dtype="bfloat16")
     return dataclasses.replace(salad(model, preset), model=whole)
@@ -103,9 +103,9 @@ def vlad_buff(model: ModelConfig, preset: str) -> TrainConfig:
 def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
     """Make CricaVPR's recipe, from Lu-Feng/CricaVPR (Lu et al., CVPR 2024).
 
-    It has multi-resolution adapters, a GeM pyramid, and Adam with step decay. Its README trains for
-    10 epochs, too few for its patience of 10 to take effect. The best weights are those with the
-    best R@5, as in its current code; its first version added R@1.
+    It has multi-resolution adapters, a GeM pyramid, and Adam with step decay. The code's README
+    trains for 10 epochs, too few for its patience of 10 to take effect. The best weights are those
+    with the best R@5, as in the current code; its first version took the sum of R@1 and R@5.
     """
     backbone = _vit(model, adapter="multi-resolution")
     alone = model_of(model, preset, backbone, "gem-pyramid", antialias=False, pixels="floats")
@@ -147,8 +147,8 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
 def selavprpp(model: ModelConfig, preset: str) -> TrainConfig:
     """Make SelaVPR++'s recipe, from Lu-Feng/SelaVPRplusplus (Lu et al. 2025): its first stage.
 
-    What trains is the head, and adapters on a path parallel to the frozen blocks (for preset l14,
-    the last 16). Its data are GSV-Cities and parts of other sets as places in one layout. The
+    The head trains, and adapters on a path parallel to the frozen blocks (for preset l14, the last
+    16). The authors train on GSV-Cities and parts of other sets, as places in one layout. The
     second stage, which trains another path for the signs of the descriptor, is not included.
     """
     is_large = preset == "l14"
@@ -190,11 +190,11 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("supervlad")
 def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SuperVLAD's recipe, from Lu-Feng/SuperVLAD (NeurIPS 2024), without its encoder.
+    """Make SuperVLAD's recipe, from Lu-Feng/SuperVLAD (NeurIPS 2024): no cross-image encoder.
 
     The last four blocks train. The score layer starts from k-means centroids of 5,000 training
-    images. The code uses images of MSLS for these, at 322 x 322. (The encoder of its cross-image
-    model has a separate optimiser, which gets no gradient after the first step.)
+    images; the authors' code takes images of MSLS instead, at 322 x 322. (In that code, the encoder
+    of the cross-image model has its own optimiser, which gets no gradient after the first step.)
     """
     return TrainConfig(
         model=model_of(
@@ -213,9 +213,9 @@ def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
 def image(model: ModelConfig, preset: str) -> TrainConfig:
     """Make ImAge's recipe, from Lu-Feng/ImAge (NeurIPS 2025): DINOv2 with registers.
 
-    The blocks train from the one where the tokens enter. The tokens start from centroids of the
-    last features of 5,000 training images. The code uses images of MSLS for these by default, at
-    322 x 322.
+    The block where the aggregation tokens enter and all later ones train. The tokens start from
+    centroids of the last block's features of 5,000 training images; the authors' code takes images
+    of MSLS instead by default, at 322 x 322.
     """
     config = model_of(
         model,
@@ -238,7 +238,7 @@ def boq(model: ModelConfig, preset: str) -> TrainConfig:
     """Make BoQ's recipe over DINOv2, from amaralibey/Bag-of-Queries (Ali-bey et al., CVPR 2024).
 
     The last two blocks train. The head is that of the published weights, with 12,288 dimensions;
-    the code's default is wider and has 8,192.
+    the default head of the code is wider, but has 8,192 dimensions.
     """
     return TrainConfig(
         model=model_of(
@@ -256,9 +256,9 @@ def boq(model: ModelConfig, preset: str) -> TrainConfig:
 def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
     """Make DINO-Mix's recipe (GaoShuang98/DINO-Mix, Huang et al. 2024): two mixers over DINOv2.
 
-    The last four blocks, the class token and the positions train, because its code freezes
-    everything else before the blocks. Its code chooses the best weights by validation on Pitts30k's
-    test set; here they are chosen on `--val`.
+    The last four blocks train. So do the class token and the position embeddings, because the
+    authors' code freezes only the other parameters before the blocks. That code chooses the best
+    weights on the test set of Pitts30k; here they are chosen on `--val`.
     """
     return TrainConfig(
         model=model_of(
@@ -284,8 +284,8 @@ def salad_cm(model: ModelConfig, preset: str) -> TrainConfig:
     """Make SALAD-CM's recipe, from serizba/cliquemining (Izquierdo and Civera, ECCV 2024).
 
     It is SALAD's, but half of the places are cliques of MSLS: `--data gsv=DIR msls=DIR`. The code
-    describes MSLS once, with a trained SALAD, and draws its cliques in advance; here the model
-    being trained describes it again before each epoch.
+    computes descriptors of MSLS once, with a trained SALAD, and draws all cliques in advance; here
+    the model that is being trained computes them again before each epoch.
     """
     sets = MixtureSet("gsv"), MixtureSet("msls", sampler="cliques")
     return dataclasses.replace(salad(model, preset), mixture=sets)
@@ -295,11 +295,11 @@ def salad_cm(model: ModelConfig, preset: str) -> TrainConfig:
 def sage(model: ModelConfig, preset: str) -> TrainConfig:
     """Make a recipe for SAGE (Chen et al., ICLR 2026), whose training code is not published.
 
-    The model, a frozen backbone and the kind of sampler are the paper's: a graph of image positions
-    and visual similarity, rebuilt by the model before each epoch, in which cliques grow
-    (`geo-visual`). Everything else is our choice and follows SALAD-CM: the sets (`--data gsv=DIR
-    msls=DIR`), the batches, the loss, the optimiser and the training size. `sage+sage-encoder` has
-    the cross-image encoder.
+    The model, the frozen backbone and the kind of sampler are the paper's. The sampler
+    (`geo-visual`) grows cliques in a graph of image positions and visual similarity, which the
+    model rebuilds before each epoch. Everything else is our choice and follows SALAD-CM: the sets
+    (`--data gsv=DIR msls=DIR`), the batches, the loss, the optimiser and the training size.
+    `sage+sage-encoder` has the cross-image encoder.
     """
     backbone = _vit(model, adapter="dynamic-power")
     whole = model_of(model, preset, backbone, "sage", antialias=False, pixels="floats")
@@ -319,8 +319,8 @@ def megaloc(model: ModelConfig, preset: str) -> TrainConfig:
     Its paper adds the losses of six sub-batches of 32 places: GSV-Cities, MSLS (cliques),
     MegaScenes, ScanNet, and San Francisco XL twice (EigenPlaces' lateral and frontal classes), as
     `--data gsv=DIR msls=DIR megascenes=DIR scannet=DIR lateral=DIR frontal=DIR`, or some of them.
-    The paper chooses quadruplets of MegaScenes and ScanNet by overlapping views; here they are
-    places of a table. The optimiser, the trainable parameters and the epochs are SALAD's.
+    The paper chooses quadruplets of MegaScenes and ScanNet by overlapping views; here you list such
+    places in a table. The optimiser, the trainable parameters and the epochs are SALAD's.
     """
     whole = model_of(
         *(model, preset, _vit(model), "salad"),

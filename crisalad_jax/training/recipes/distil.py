@@ -10,7 +10,7 @@ from crisalad_jax.training.recipes.base import from_scratch, register_recipe
 
 @register_recipe("distil")
 def distil(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of `crisalad distil`: `scratch`, with one image of each place.
+    """Make the recipe of `crisalad distil`: that of `scratch`, with one image of each place.
 
     The student has no cross-image encoder, so that its descriptors are single-image.
     """

@@ -13,7 +13,7 @@ from crisalad_jax.training.recipes.base import model_of, register_recipe
 from crisalad_jax.training.schedules import MilestonesSchedule, StepSchedule
 
 MARGIN = 0.1**0.5
-"""The code's margin of 0.1 is for squared distances; its square root is for Euclidean ones."""
+"""Margin of Euclidean distances: the square root of the code's 0.1 for squared distances."""
 _SGD = OptimiserConfig(
     kind="sgd", learning_rate=1e-4, schedule=StepSchedule(epochs=5), weight_decay=1e-3
 )
@@ -28,14 +28,14 @@ def _model(model: ModelConfig, preset: str, **head: Any) -> ModelConfig:
 def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     """Make NetVLAD's recipe, from Nanne/pytorch-NetVlad: tuples mined in pitts30k_train.mat.
 
-    The last stage of VGG-16 trains. A batch is 4 tuples of 12 images. Every 1,000 queries all
-    images are described again, and each query takes the 10 hardest of 1,000 random negatives and
-    its previous ones, if they violate the margin.
+    The last stage of VGG-16 trains. A batch is 4 tuples of 12 images. Every 1,000 queries, all
+    images are described again, and each query takes the 10 hardest of its previous negatives and
+    1,000 random ones, if they violate the margin.
 
-    Its schedule steps before an epoch, not after it: the first four epochs have the full learning
-    rate. It stops after more than 10 epochs without gain. It draws a round's queries from a fixed
-    part of the file; here all are shuffled. Its loader processes lose a query's last negatives with
-    each round; the paper reuses them, and so does this recipe.
+    The code's schedule steps before an epoch, not after it, so the first four epochs have the full
+    rate. Training stops after more than 10 epochs without gain. The code draws a round's queries
+    from a fixed part of the file; here all are shuffled. Its loader processes lose a query's
+    previous negatives after each round; the paper reuses them, and so does this recipe.
     """
     return TrainConfig(
         model=_model(model, preset),
@@ -57,13 +57,13 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
 def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of Patch-NetVLAD's Mapillary weights: NetVLAD's, with 16 clusters, on MSLS.
 
-    Tuples have 5 negatives, the hardest of 1,000 for all queries of a round. The learning rate
-    falls after every fifth epoch.
+    Tuples have 5 negatives, the hardest of 1,000 that all queries of a round share. The learning
+    rate falls after every fifth epoch.
 
     The code draws queries with replacement, those at night or sideways more often; here each is
-    used in turn. It leaves out candidates near any query of a round; here, those near the tuple's
-    own query. With its sign of inner products, nearly every query passes its test for violations;
-    here every one does. Patch re-ranking learns nothing; `crisalad pca` fits the whitening.
+    used in turn. The code leaves out candidates near any query of a round; here, those near the
+    tuple's own query. The code's sign of inner products lets nearly all queries pass its margin
+    test; here all pass. Patch re-ranking learns nothing; `crisalad pca` fits the whitening.
     """
     return dataclasses.replace(
         netvlad(model, preset),

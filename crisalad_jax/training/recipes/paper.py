@@ -15,7 +15,7 @@ def crisalad(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("crisalad-1e-4")
 def crisalad_1e_4(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of Table 2's row with a higher learning rate."""
+    """Make the recipe of the row of Table 2 with a higher learning rate, 1e-4."""
     return TrainConfig(
         model=model, optimiser=dataclasses.replace(TrainConfig.optimiser, learning_rate=1e-4)
     )
@@ -23,7 +23,7 @@ def crisalad_1e_4(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("crisalad-step")
 def crisalad_step(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of Table 2's row with the step schedule."""
+    """Make the recipe of the row of Table 2 with the step schedule."""
     return TrainConfig(
         model=model, optimiser=dataclasses.replace(TrainConfig.optimiser, schedule="step")
     )
