@@ -51,9 +51,9 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
         The path of the weight file, a .safetensors file of this package in the cache.
 
     Raises:
-        InputError: the download fails; or the published file is unreadable, differs from the first
-            download, or is not this model; it is missing, and the network is disabled or no address
-            is known; torch is needed but not installed; or the cache cannot be written to.
+        InputError: the download fails, or is impossible because the network is disabled or no
+            address is known; the published file is unreadable, differs from the first download, or
+            is not this model; torch is needed but not installed; or the cache cannot be written to.
     """
     if not _is_ready(model):
         try:

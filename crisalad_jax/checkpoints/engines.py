@@ -15,7 +15,7 @@ from crisalad_jax.utils.output import warn
 EngineName = Literal["onnxruntime", "openvino"]
 Precision = Literal["float32", "bfloat16"]
 Program = Callable[..., np.ndarray]
-"""A loaded program: a function of numpy arrays, its inputs in order, that returns its output."""
+"""A loaded program: a function that takes arrays, the inputs in order, and returns the output."""
 
 
 class NotExportableError(InputError):
@@ -96,7 +96,7 @@ def load_program(
         precision: type of the matrix products; onnxruntime supports only "float32".
 
     Returns:
-        A function of numpy arrays, the program's inputs in order, that returns its output.
+        A function that takes the program's inputs in order (numpy arrays) and returns its output.
 
     Raises:
         InputError: the engine cannot load the file, or does not support the precision.

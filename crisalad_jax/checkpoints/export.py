@@ -50,7 +50,7 @@ from crisalad_jax.utils.target import PORTABLE, STRAIGHT, jax_setting, lowering_
 PROGRAM, WEIGHTS = "describe.jax_export", "weights.safetensors"
 FORMATS = ("stablehlo", *engines.FORMATS)
 TOLERANCE = 1e-5
-"""Largest allowed difference of a program's descriptors from `describe`'s, at unit length."""
+"""Largest allowed difference from `describe` in an element of a descriptor of unit length."""
 GROUPINGS = {
     "single": "every image is described independently",
     "batch": "the images of a call attend to each other",
@@ -77,7 +77,7 @@ class ExportConfig:
 
     grouping: Literal["single", "batch", "any"] = "single"
     """Which images of a call attend to each other: "single", none; "batch", all; "any", those that
-    a mask allows, in two ONNX or OpenVINO programs: images to tokens, tokens to descriptors."""
+    a mask allows (ONNX and OpenVINO only: one program makes tokens, a second one descriptors)."""
     batch_size: int | None = None
     """Number of images in a call; None allows any number (a symbolic dimension)."""
     weights_inside: bool = False
@@ -88,10 +88,10 @@ class ExportConfig:
     """StableHLO, which JAX runs; ONNX, which most engines read; or the format of OpenVINO."""
     pixels: Literal["bytes", "floats"] | None = None
     """Type of the input images: "bytes", 8-bit pixels, which the program normalises, or "floats",
-    already normalised; None is the type that the model resizes (`PreprocessingConfig.pixels`)."""
+    already normalised; None takes the type of the model's `PreprocessingConfig.pixels`."""
     for_colmap: bool = False
-    """Whether an ONNX program has the inputs and outputs of COLMAP's draft of global-descriptor
-    retrieval: `images`, normalised floats (batch, 3, height, width), and `descriptor`."""
+    """Whether an ONNX program suits COLMAP's unreleased retrieval by global descriptors: it takes
+    `images`, normalised floats (batch, 3, height, width), and returns `descriptor`."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -119,10 +119,10 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
     """Check that a model can be exported as `how` specifies, without tracing it.
 
     Raises:
-        InputError: the parameters are of another configuration; there are 2 GiB or more of weights
-            inside the program; optimal transport raises unless converged (`throw`); float inputs
-            with local-contrast normalisation; normalisation other than ImageNet's for COLMAP; or a
-            compute type other than float32 in a format other than StableHLO.
+        InputError: the parameters do not fit `config`; 2 GiB or more of weights would be inside the
+            program; optimal transport raises unless converged (`SinkhornConfig.throw`); inputs are
+            floats, but normalised by local contrast; inputs are COLMAP's, but not normalised by
+            ImageNet's mean and deviation; or only StableHLO allows `config.compute_dtype`.
     """
     check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
@@ -149,8 +149,8 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
 
     `weights`, a dictionary of the arrays by dotted names, is absent if `how.weights_inside` is set.
     `images` are RGB (batch, height, width, 3) of `config.input_size`, uint8 or normalised float32
-    (`ExportConfig.pixels`). The function returns descriptors (batch, descriptor). It depends on
-    neither the exporting platform nor the caller. Call `check_exportable` first.
+    (`ExportConfig.pixels`). The function returns descriptors (batch, descriptor). It is the same
+    on whatever platform and from whatever code it is exported. Call `check_exportable` first.
     """
     program = _whole_program(Model(params, config), how)
     run, weights, (images,) = program.run, program.weights, program.inputs.values()
@@ -232,23 +232,23 @@ def write_export(
 ) -> dict[str, Any]:
     """Write a model as a program into the new folder `out`, atomically.
 
-    A program in a format other than StableHLO is run once, and its descriptors are compared with
-    those of `describe`.
+    An ONNX or OpenVINO program is run once, to compare its descriptors with those of `describe`.
 
     Args:
         out: the folder.
         model: parameters and configuration.
         how: format, inputs and platforms of the program.
-        calibration: prepared images (image, height, width, 3) that calibrate int8 matrix products,
-            for ONNX and OpenVINO; None keeps float32. The manifest records the difference.
+        calibration: prepared images (image, height, width, 3) to calibrate int8 matrix products
+            with, for ONNX and OpenVINO; None keeps float32. An int8 program may differ from
+            `describe` by any amount, which the manifest records.
 
     Returns:
         The content of manifest.json.
 
     Raises:
         InputError: `check_exportable` rejects the model; `out` is a file or a non-empty folder;
-            `calibration` comes with StableHLO, grouping "any", a batch size or weights inside; or
-            ONNX lacks an operation of the model, or descriptors differ from those of `describe`.
+            `calibration` comes with StableHLO, grouping "any", a batch size or weights inside; an
+            operation cannot be converted; or, in float32, descriptors differ from `describe`'s.
         ModuleNotFoundError: the extra "onnx" or "openvino" is needed but not installed.
 
     Example:

@@ -25,17 +25,17 @@ HUB_FILE = "model.safetensors"
 
 @takes(path=PATH)
 def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = False) -> "Model":
-    """Load a model from a file of this package, a public checkpoint, or by a published name.
+    """Load a model from a weight file of this package, a public checkpoint, or by its name.
 
     Args:
-        path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
-            DINO-SALAD, CricaVPR or another format (docs/how-to/use-public-checkpoints.md), which
-            needs torch; the name of a published model, as `crisalad models` lists them, which is
-            downloaded once into the cache; "starter", the small model in this package; "hog" or
-            "thumbnail", untrained baselines; a folder that `crisalad publish` wrote; or
-            hf://OWNER/NAME, such a folder on Hugging Face's hub, optionally with @REVISION and
-            /FILE (extra `data`).
-        verify: whether to check a file of this package against its checksum.
+        path: a weight file of this package (.safetensors); a public checkpoint, such as DINOv2's,
+            DINO-SALAD's or CricaVPR's (docs/how-to/use-public-checkpoints.md; most need torch); the
+            name of a published model, as `crisalad models` lists them, which is downloaded once
+            into the cache; "starter", the small model in this package; "hog" or "thumbnail",
+            untrained baselines; a folder that `crisalad publish` wrote; or hf://OWNER/NAME, such a
+            folder on Hugging Face's hub, optionally with @REVISION and /FILE (needs the extra
+            `data`).
+        verify: whether to check a weight file of this package against its checksum.
         quiet: whether to hide the progress of a download.
 
     Returns:
@@ -73,8 +73,8 @@ def find_weights(
     Args:
         weights: a path; a name; hf://OWNER/NAME, a repository on Hugging Face's hub; a folder with
             the layout of such a repository; or None, which is "starter", with a warning.
-        engine: where the model will run; for "auto", an exported folder is accepted too, and for
-            engines other than "jax" any folder.
+        engine: where the model will run. "auto" accepts an exported folder too; "onnxruntime" and
+            "openvino" accept any folder.
         quiet: whether to hide the progress bar.
 
     Returns:
@@ -172,7 +172,7 @@ def open_model(
         quiet: whether to hide the progress of a download.
 
     Raises:
-        InputError: as for `find_weights`, `load_weights` and `open_runtime`; or from `changed`.
+        InputError: the model cannot be found, read, or opened in `engine`; or `changed` raises it.
     """
     file = find_weights(weights, engine=engine, quiet=quiet)
     short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name

@@ -73,10 +73,10 @@ class _Declared:
 
 
 def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
-    """Read a public checkpoint, or a file of this package; half precision becomes float32 exactly.
+    """Read a public checkpoint, or a weight file of this package.
 
-    Torch files are read with `torch.load(weights_only=True)`, which runs no code in the file.
-    `verify` compares a file of this package with its checksum.
+    Half precision becomes float32, which is exact. `torch.load(weights_only=True)` reads torch
+    files, without running code in them. `verify` compares a weight file with its checksum.
 
     Raises:
         InputError: the file is missing, damaged or of unknown format, asks to run code, or does not
@@ -163,7 +163,7 @@ def read_vocabulary(
 
 
 def vocabulary_model(words: int, model: ModelConfig, fields: Mapping[str, Any]) -> ModelConfig:
-    """Return AnyLoc's configuration on a model's backbone; `fields` are as in `read_vocabulary`."""
+    """Return AnyLoc on `model`'s backbone: `words` clusters, `fields` as in `read_vocabulary`."""
     return dataclasses.replace(
         model,
         preprocessing=PreprocessingConfig(size_rule="native", pixels="floats"),
@@ -174,7 +174,7 @@ def vocabulary_model(words: int, model: ModelConfig, fields: Mapping[str, Any]) 
 
 
 def format_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
-    """Return the name of a public format that fits `target`'s suffix and can hold the model."""
+    """Return the name of a format for `target`'s suffix that can hold the model, or a fallback."""
     is_safetensors = pathlib.Path(target).suffix in SUFFIXES["safetensors"]
     stored, fallback = ("safetensors", "huggingface") if is_safetensors else ("torch", REFERENCE)
     for name, each in FORMATS.items():
@@ -220,7 +220,7 @@ def write_checkpoint(
 
 
 class Conversion(NamedTuple):
-    """A finished conversion: formats of source and target (None for this package's) and model."""
+    """A finished conversion: both formats (None for this package's) and the model's `config`."""
 
     source: str | None
     target: str | None
@@ -237,17 +237,17 @@ def convert(
     fields: Mapping[str, Any] | None = None,
     half: bool = False,
 ) -> Conversion:
-    """Convert a public checkpoint to a file of this package, or the reverse.
+    """Convert a public checkpoint to a weight file of this package, or the reverse.
 
     Args:
-        source: a public checkpoint (docs/how-to/use-public-checkpoints.md), or a file of this
-            package.
-        target: the file to write: a public checkpoint for a source of this package, unless `half`
-            is set; otherwise a .safetensors file of this package.
+        source: a public checkpoint (docs/how-to/use-public-checkpoints.md), or a weight file of
+            this package.
+        target: the file to write: a public checkpoint if the source is a weight file and `half` is
+            not set; otherwise a weight file of this package (.safetensors).
         format: name of the public format to write, such as "reference"; None chooses one that fits.
         backbone: the backbone's checkpoint, for a source that is only an AnyLoc vocabulary.
         fields: settings of such a vocabulary: `layer`, `facet`, `assignment` of `AnyLocConfig`.
-        half: whether to write a file of this package in float16, from either kind of source.
+        half: whether to write a weight file in float16, from either kind of source.
 
     Returns:
         The formats of source and target, and the model's configuration.
@@ -298,8 +298,8 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     `fresh` are. If the file's ResNet has more stages than `config`, the first ones are used.
 
     Args:
-        path: a public checkpoint (docs/how-to/use-public-checkpoints.md), or a file of this
-            package.
+        path: a public checkpoint (docs/how-to/use-public-checkpoints.md), or a weight file of
+            this package.
         config: configuration of the model's backbone.
         fresh: parameters of a backbone with that configuration, such as `config.init` makes.
 
@@ -335,6 +335,6 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
 def with_backbone_of(
     params: Crisalad, config: ModelConfig, path: str | os.PathLike[str]
 ) -> Crisalad:
-    """Return a model's parameters with the backbone of the checkpoint `path` (`read_backbone`)."""
+    """Return a model's parameters, but with the backbone that `read_backbone` reads from `path`."""
     backbone = read_backbone(path, config.backbone, params.backbone)
     return dataclasses.replace(params, backbone=backbone)

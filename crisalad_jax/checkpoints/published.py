@@ -21,7 +21,7 @@ class Licence:
     """The licence of a repository that publishes a model."""
 
     name: str
-    """SPDX identifier, or a phrase if the repository has no licence."""
+    """SPDX identifier, or a phrase for a custom licence or for none, such as "no licence file"."""
     commercial: bool | None = None
     """Whether it allows commercial use; None if the repository does not say."""
     terms: str = ""
@@ -58,14 +58,14 @@ class Published:
     repository: str
     """Address of the page that publishes the file."""
     file: str
-    """Name of the file, also at a mirror."""
+    """Name of the file; mirrors use the same name."""
     url: str | None
     """Address of the file; None if it has none of its own, as in a shared folder or an archive."""
     paper: str
     """Authors, venue and year."""
     backbone: str = ""
-    """Name of the published model whose backbone the file's vocabulary is for; empty if the file is
-    a complete model."""
+    """If the file holds only a vocabulary, the name of the published model whose backbone it needs;
+    otherwise empty."""
     note: str = ""
     """What is uncertain about these facts, or how to get the file by hand; may be empty."""
 

@@ -119,7 +119,7 @@ class Runtime:
             )
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[np.ndarray, ImageBatch]]:
-        """Yield (rows, batch) for each batch: rows (image, number) of tokens, for `attend`."""
+        """Yield (rows, batch) for each batch: rows (image, row_length) of tokens, for `attend`."""
         for batch in batches:
             yield self._rows(batch.images), batch
 
@@ -156,8 +156,8 @@ class Runtime:
         """Compute descriptors from the tokens of groups of images.
 
         Args:
-            rows: rows from `tokens`, (group, image, number).
-            mask: `mask[g, i, j]` lets image i of group g attend to image j.
+            rows: rows from `tokens`, (group, image, row_length).
+            mask: booleans; `mask[g, i, j]` lets image i of group g attend to image j.
 
         Returns:
             Descriptors (group, image, dim). Unless `grouping` is "any", they are the rows as given.
@@ -181,8 +181,8 @@ def open_runtime(
     JAX is imported only if `source` is a weight file that was not exported before.
 
     Args:
-        source: a folder of `crisalad export` in a format that the engine reads, or a weight file
-            of this package.
+        source: a folder that `crisalad export` wrote in a format that the engine reads, or a
+            weight file of this package.
         engine: "onnxruntime" or "openvino".
         config: a `ModelConfig` as JSON values, which sets image size, preprocessing and compute
             type; None uses the model's own, in float32. Only OpenVINO supports bfloat16.
@@ -194,8 +194,8 @@ def open_runtime(
         The model.
 
     Raises:
-        InputError: there is no such folder or file; it is damaged, of a format that the engine does
-            not read, or for images of another size or type; or a weight file cannot be exported.
+        InputError: the folder or file is missing or damaged; the engine does not read its format;
+            its image size or type differs from `config`; or a weight file cannot be exported.
         ModuleNotFoundError: the engine is not installed.
 
     Example:
@@ -253,8 +253,8 @@ def fastest_engine(
 
     Only installed engines are considered: ONNX Runtime first, then OpenVINO, which is as fast but
     takes longer to start (docs/performance.md). A weight file is exported for the engine once, and
-    its descriptors are compared with JAX's. JAX is chosen if it may have an accelerator, for
-    bfloat16, for images without a fixed size, with plug-ins, and if no engine can be used.
+    its descriptors are compared with JAX's. It runs in JAX if JAX may have an accelerator, if
+    plug-ins are loaded, if `config` isn't float32 at a fixed image size, or if no engine works.
 
     Args:
         source: a weight file, or an exported folder.

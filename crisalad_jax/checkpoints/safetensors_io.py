@@ -63,8 +63,8 @@ def write_sealed(
     Args:
         path: the file.
         arrays: arrays by name.
-        form: the format and its version: the only key of the metadata, because safetensors does not
-            preserve the order of several keys.
+        form: the format and its version, such as `WEIGHTS`. It is the only key of the metadata,
+            because safetensors does not preserve the order of several keys.
         value: the object, as JSON values.
 
     Raises:

@@ -17,7 +17,7 @@ FILE = pathlib.Path(__file__).with_name(f"{NAME}.safetensors")
 FILES = {name: FILE.with_stem(name) for name in (NAME, "starter-1", "hog", "thumbnail")}
 """The files of all models in this package by their names."""
 BEST = "megaloc"
-"""The published model with the best recall, which a warning names."""
+"""The published model with the best recall, which a warning recommends."""
 
 
 def named(weights: str | os.PathLike[str]) -> str:

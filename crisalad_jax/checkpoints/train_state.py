@@ -90,7 +90,7 @@ class StateStore:
     def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
         """Write the arrays of `state` and the JSON values of `record` as the state of `step`.
 
-        It replaces any state of that step. It copies the arrays, and writes them in the background.
+        Any stored state of that step is replaced. Arrays are copied, and written in the background.
 
         Raises:
             InputError: this state, or an earlier one, cannot be written.
@@ -174,7 +174,7 @@ class StateStore:
             self._manager.wait_until_finished()
 
     def close(self) -> None:
-        """Wait until all states are on disk, and close the store; raise as `wait` does."""
+        """Wait until all states are on disk (InputError if one fails), and close the store."""
         with self._written():
             self._manager.close()
         self._clear()

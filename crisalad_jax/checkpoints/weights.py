@@ -63,9 +63,9 @@ class Checkpoint(NamedTuple):
     extras: dict[str, np.ndarray]
     """Arrays of a public checkpoint that no descriptor needs."""
     format: str | None = None
-    """Public format of the file; None for a file of this package."""
+    """Public format of the file; None for a weight file of this package."""
     digest: str | None = None
-    """The `model_hash` of the parameters, for a file of this package."""
+    """The `model_hash` of the parameters; None for a public checkpoint."""
     loss: tuple[dict, dict[str, np.ndarray]] | None = None
     """`Header.loss` and the loss's parameters by name, if the file has them."""
     restriction: str = ""
@@ -153,8 +153,8 @@ def load_weights(
 
     Args:
         path: the file; `find_weights` finds the file of a named model.
-        expected: if given, the configuration that the file must have, except for what parameters
-            do not depend on: image size (except for MixVPR), resize, dropout, compute type, remat.
+        expected: the configuration that the file must have; None allows any. Fields that parameters
+            do not depend on may differ, such as image size (not MixVPR's), resize and dropout.
         verify: whether to check the file against its checksum.
 
     Returns:
@@ -187,7 +187,7 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
     """Read everything that `save_weights` wrote, with the arguments of `load_weights`.
 
     Raises:
-        InputError: in the cases in which `load_weights` without `expected` raises it.
+        InputError: the file or its model is invalid, as for `load_weights` without `expected`.
     """
     try:
         value, arrays = read_sealed(path, FORMAT, EXPECTED, verify=verify)

@@ -1,7 +1,7 @@
 """The command line: a module for each command, which parses its flags and calls the library.
 
-Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 143 ended by
-SIGTERM, 129 by SIGHUP, 134 a process of the run was lost (also 2), 1 anything else.
+Exit codes: 0 done; 2 bad arguments or input (one line on stderr); 130 interrupted; 143 ended by
+SIGTERM; 129 ended by SIGHUP; 134 (or 2) a process of the run was lost; 1 anything else.
 """
 
 import dataclasses

@@ -11,9 +11,9 @@ class Ablate(ComparisonFlags):
     """Train CriSALAD with one part changed at a time, and show costs (the paper's Tables 2, 3)."""
 
     rows: str | None = None
-    """Comma-separated; by default the paper's: crisalad, lr-1e-4, step, multi-resolution, mlp,
-    no-adapter, no-encoder, no-encoder-step. NAME or KIND:NAME of a registered part is a row too:
-    CriSALAD with that part. With --row the default is only crisalad."""
+    """Rows, comma-separated; by default the paper's: crisalad, lr-1e-4, step, multi-resolution,
+    mlp, no-adapter, no-encoder, no-encoder-step. NAME or KIND:NAME of a registered part is a row
+    too: CriSALAD with that part. With --row the default is only crisalad."""
     row: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A custom row, as "NAME: flag=value, flag=value" with any flags of `train` that set the model,
     loss, optimiser, augmentation or training, and recipe=NAME to start from a recipe other than

@@ -33,7 +33,7 @@ class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     watch: tuple[pathlib.Path, ...] = ()
     """Evaluation sets of other places, whose recall is compared before and after."""
     most_lost: float = 0.005
-    """Largest drop in Recall@1 of a watched set, as a fraction, that allows replacing the map."""
+    """With --replace: keep the old map if a watched set loses more Recall@1 than this (0 to 1)."""
     replace: bool = False
     """Rebuild the map with the adapted model; the old map stays until the new one is complete."""
 

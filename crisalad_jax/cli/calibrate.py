@@ -33,7 +33,7 @@ class Calibrate(ReadFlags, SetFlags, MapFlags, TableFlags):
 
 
 def run(arguments: Calibrate) -> dict[str, Any]:
-    """Calibrate the map, and print what is stored in it; return that for --json."""
+    """Calibrate the map, and print the calibration; return it as JSON values for --json."""
     refuse_without("--verify", arguments.verify, matcher=arguments.matcher)
     verify = None
     if arguments.verify is not None:

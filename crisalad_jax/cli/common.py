@@ -221,7 +221,7 @@ def given_positions(flags: PositionFlags) -> "Track | pathlib.Path | None":
     """Return --positions in the form that the library takes: a file, or a track with its times.
 
     Raises:
-        InputError: a time is given without --positions, or the track cannot be read.
+        InputError: a time flag is given without --positions, or the track cannot be read.
     """
     start, offset = flags.start_time, flags.time_offset
     refuse_without("--positions", flags.positions, start_time=start, time_offset=offset)
@@ -233,7 +233,7 @@ def given_positions(flags: PositionFlags) -> "Track | pathlib.Path | None":
 
 
 def open_set(flags: Any) -> "Benchmark":
-    """Open the evaluation set that `SetFlags` and `ReadFlags` name, and print its size and rule.
+    """Open the evaluation set that the flags name, and print its size and what counts as positive.
 
     Raises:
         InputError: the set cannot be read, or the flags do not fit it.

@@ -21,8 +21,8 @@ class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     """Training set: a folder with one folder per place, a table name,place[,lat,lon[,heading]]
     (places.csv in the folder, or the file), or Dataframes/ and Images/ of GSV-Cities."""
     backbone: pathlib.Path | None = None
-    """Train from this backbone, as the recipes say: a file of this package, a public checkpoint, or
-    a published model's name. None trains from scratch, by the recipe scratch."""
+    """Train from this backbone, as the recipes say: a weight file of this package, a public
+    checkpoint, or a published model's name. Without it, the recipe scratch trains from scratch."""
     preset: str = "b14"
     """Model size: tiny, s14, b14, l14 or g14."""
     seeds: int = 3
@@ -93,9 +93,9 @@ class Compare(ComparisonFlags):
     """Train or load the paper's Table 1 methods, evaluate them the same way, and print tables."""
 
     methods: str | None = None
-    """Comma-separated. By default the models of --weights; without --weights, or if it names only
-    methods, those of Table 1 over one backbone: crisalad+netvlad (or gem, conv-ap, patch-netvlad,
-    transvpr, mixvpr: that head with CriSALAD's backbone and training), cosplace-vit,
+    """Methods, comma-separated. By default the models of --weights; without --weights, or if it
+    names only methods, those of Table 1 over one backbone: crisalad+netvlad (or gem, conv-ap,
+    patch-netvlad, transvpr, mixvpr: that head with CriSALAD's backbone and training), cosplace-vit,
     eigenplaces-vit, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is a method too,
     and so is RECIPE+PART, with a registered part as NAME or KIND:NAME."""
     weights: tuple[str, ...] = ()

@@ -21,13 +21,13 @@ _FORMATS = (
 
 
 class Convert(PluginFlag, JsonFlag):
-    """Convert a public torch checkpoint to a file of this package, or such a file back."""
+    """Convert a public checkpoint to this package's .safetensors format, or back."""
 
     source: Annotated[
         tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC", help=_SOURCES)
     ]
     target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST"), Target()]
-    """File to write: .safetensors, or for a source of this package a public checkpoint."""
+    """File to write: .safetensors, or a public checkpoint if SRC is in this package's format."""
     format: Annotated[str | None, tyro.conf.arg(help=_FORMATS)] = None
     backbone: pathlib.Path | None = None
     """For a vocabulary of AnyLoc, which is a single tensor: checkpoint of its backbone, or a
@@ -40,12 +40,12 @@ class Convert(PluginFlag, JsonFlag):
     assignment: str | None = None
     """With --backbone: how the nearest word is found: cosine, as published, or euclidean."""
     half: bool = False
-    """Write a file of this package in half precision, in half the space; also from a source of this
-    package."""
+    """Write this package's format in half precision, in half the space, whatever the format of
+    SRC."""
 
 
 def run(arguments: Convert) -> dict[str, Any]:
-    """Convert the file, and print both formats and the model; return them for --json."""
+    """Convert the file, and print both formats and the model; return the result for --json."""
     source, target, backbone = arguments.source, arguments.target, arguments.backbone
     given = pick(arguments, "layer", "facet", "assignment")
     fields = {name: value for name, value in given.items() if value is not None}

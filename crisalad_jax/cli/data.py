@@ -39,7 +39,7 @@ class Data(TableFlags, QuietFlag):
 
 
 def run(arguments: Data) -> dict[str, Any] | None:
-    """List the sets, fetch one, or check a folder; return what is still to write for --json."""
+    """List the sets, fetch one, or check a folder; return the result for --json, unless written."""
     if arguments.action != "fetch":
         refuse_with(f"data {arguments.action}", to=arguments.to)
     if arguments.action != "check":

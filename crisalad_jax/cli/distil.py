@@ -48,7 +48,7 @@ class Distil(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
-    """Return the arguments, with a name as --student made a path: the model determines flags.
+    """Return the arguments, with the name of a model in --student replaced by its path.
 
     Raises:
         InputError: the weights cannot be found or read.

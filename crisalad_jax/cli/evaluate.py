@@ -55,10 +55,10 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     (docs/methods.md); local, with SIFT (docs/verification.md). Adds a row for each row of the
     table."""
     rerank_weights: pathlib.Path | None = None
-    """Model that makes the features for --rerank, as --weights; by default the first stage's. For
-    local, a matcher as an ONNX file."""
+    """Model that makes the features for --rerank: a file or a name; by default the evaluated model.
+    For local, a matcher as an ONNX file."""
     precision: float | None = None
-    """Also print the minimum similarity at which this share of the accepted first retrievals is
+    """Also print the minimum similarity at which this share of the accepted first answers is
     correct, such as 0.99, and the remaining recall."""
     seed: int = 0
     """Seed of the first shuffled order, and of untrained weights."""

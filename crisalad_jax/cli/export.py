@@ -17,7 +17,7 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
     """Write a model as a program that runs without this package: StableHLO, ONNX or OpenVINO."""
 
     weights: pathlib.Path
-    """A .safetensors file of this package, or a published model's name (`crisalad models`)."""
+    """A weight file of this package, or a published model's name (`crisalad models`)."""
     out: Annotated[pathlib.Path, NEW_FOLDER]
     """New folder for the program, its manifest.json and its weights."""
     format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
@@ -31,20 +31,20 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
     weights_inside: bool = False
     """Store the weights as constants in the program, not in a file next to it."""
     pixels: Literal["bytes", "floats"] | None = None
-    """Type of the input images: bytes, which the program normalises, or normalised floats; by
-    default the type that the model resizes."""
+    """Type of the input images: bytes, which the program normalises, or floats, already normalised;
+    by default the type that the model's resize returns."""
     for_colmap: bool = False
-    """For onnx: use the inputs and outputs of COLMAP's draft of retrieval by global descriptors
+    """For onnx: use the inputs and outputs of COLMAP's unreleased retrieval by global descriptors
     (docs/export.md)."""
     int8: pathlib.Path | None = None
-    """For onnx or openvino: quantise matrix products with these photographs, a folder or other
-    source of a few dozen typical ones (one a second of a video). Costs recall (docs/export.md)."""
+    """For onnx or openvino: quantise matrix products, calibrated on these photographs: a few dozen
+    typical ones, in any image source (of a video, one a second). Costs recall (docs/export.md)."""
     platforms: str | None = None
     """For stablehlo: platforms, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
 
 
 def run(arguments: Export) -> dict[str, Any]:
-    """Export the model, and print what was written; return that for --json."""
+    """Export the model, and print what was written; return the result for --json."""
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
 
     require(
@@ -84,7 +84,7 @@ _MOST = 256
 
 
 def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray":
-    """Read up to 256 photographs, evenly spread over all; return them prepared for the model."""
+    """Read up to 256 photographs, evenly spaced in `images`; return them prepared for the model."""
     import numpy as np
 
     from crisalad_jax.data.images import read_pixels

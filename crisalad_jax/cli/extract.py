@@ -38,7 +38,7 @@ class Extract(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFl
 
 
 def run(arguments: Extract) -> dict[str, Any]:
-    """Describe the images, and print what was written; return that for --json."""
+    """Describe the images, and print what was written; return the result for --json."""
     out, how = arguments.out, pick(arguments, "grouping", "seed")
     check_extraction(out, cluster=arguments.cluster, **how)
     positions = given_positions(arguments)

@@ -44,7 +44,7 @@ class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag
     """Type of descriptors in files, by default that of the map, or float32 in a new map; bits
     stores only their signs (docs/maps.md)."""
     pca: pathlib.Path | None = None
-    """Components of `crisalad pca`, for shorter descriptors; the map stores a copy for
+    """Components that `crisalad pca` fitted, for shorter descriptors; the map stores a copy for
     queries."""
     search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None
     """Build an index for approximate search, and print its recall; exact removes it, auto chooses

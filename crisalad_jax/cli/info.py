@@ -18,20 +18,20 @@ class Info(SizeFlags, PluginFlag, TableFlags):
     preset: str | None = None
     """Model size: tiny, s14, b14 (the default), l14 or g14."""
     weights: pathlib.Path | None = None
-    """Describe this model instead: a file of this package, or a published model's name."""
+    """Describe this model instead: a weight file of this package, or a published model's name."""
     map: pathlib.Path | None = None
     """Describe the map in this folder instead."""
     checksums: bool = False
     """With --map: read all of its descriptors, and compare them with their checksums."""
     trainable: str | None = None
-    """Parameters that train, as in `train`: all, adapters,head and the like, or patterns of names;
-    by default the recipe's, for a file adapters,head, or head if it has no adapter."""
+    """Parameters that train, as in `train`: all, groups such as adapters,head, or patterns of
+    names; by default the recipe's, or with --weights adapters,head (only head without adapters)."""
     batch_size: int = 16
     """Number of images that attend to each other in the cross-image encoder."""
 
 
 def run(arguments: Info) -> dict[str, Any]:
-    """Print what a model or a map contains; return it for --json."""
+    """Print what a model or a map contains; return the result for --json."""
     refuse_without("--map", arguments.map, checksums=arguments.checksums)
     return _model(arguments) if arguments.map is None else _map(arguments.map, arguments)
 

@@ -55,7 +55,7 @@ class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     """Names of images or patterns such as 'monday/*', for list and remove; other maps, for
     merge."""
     names: bool = False
-    """With list: also the names of the images."""
+    """With list: also print the names of the images."""
     addition: int | None = None
     """With list and remove: only images of this addition (what was added from one folder on one
     day), numbered as in `list`."""
@@ -85,7 +85,7 @@ def needs_jax(arguments: Map) -> bool:
 
 
 def run(arguments: Map) -> dict[str, Any]:
-    """List or change the map, and print what was found or done; return that for --json."""
+    """List or change the map, and print what was found or done; return the result for --json."""
     action = f"map {arguments.action}"
     others = {*itertools.chain(*_FLAGS.values())} - {*_FLAGS[arguments.action]}
     refuse_with(action, **pick(arguments, *sorted(others)))

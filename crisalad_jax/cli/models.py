@@ -20,11 +20,11 @@ class Models(PluginFlag, TableFlags):
     """List the models that others published, which --weights takes by name, or describe one."""
 
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None
-    """Model whose facts are all printed."""
+    """Model to describe in full."""
 
 
 def run(arguments: Models) -> dict[str, Any]:
-    """Print the table of models, or all facts about one; return them for --json."""
+    """Print the table of models, or all facts about one; return the result for --json."""
     name = arguments.name
     if name is not None:
         refuse_with("NAME", latex=arguments.latex)

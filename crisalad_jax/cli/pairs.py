@@ -50,7 +50,7 @@ class Pairs(ReadFlags, JsonFlag):
 
 
 def needs_jax(arguments: Pairs) -> bool:
-    """Return whether the command describes images with JAX; a map's have descriptors already."""
+    """Return whether the command describes images with JAX; a map has descriptors already."""
     return arguments.images is not None and arguments.runtime == "jax"
 
 

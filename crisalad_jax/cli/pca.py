@@ -39,7 +39,7 @@ class Pca(JsonFlag, QuietFlag):
 
 
 def run(arguments: Pca) -> dict[str, Any]:
-    """Fit and write components, and print their share of the variance; return it for --json."""
+    """Fit and write components, and print what variance they keep; return the result for --json."""
     weights = arguments.weights
     checked = {"verify": arguments.checksums}
     model = None if weights is None else load(weights, quiet=arguments.quiet, **checked)

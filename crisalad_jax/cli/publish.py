@@ -26,7 +26,7 @@ class Publish(JsonFlag, PluginFlag, QuietFlag):
 
 
 def run(arguments: Publish) -> dict[str, Any]:
-    """Publish the model, and print where it is; return that for --json."""
+    """Publish the model, and print where it is; return the result for --json."""
     where = publish(
         arguments.run,
         arguments.to,

@@ -47,7 +47,7 @@ class Render(JsonFlag, QuietFlag):
 
 
 def run(arguments: Render) -> dict[str, Any]:
-    """Render the world, and print what is in it; return that for --json."""
+    """Render the world, and print what is in it; return the result for --json."""
     given = pick(arguments, *(field.name for field in dataclasses.fields(WorldConfig)))
     config = WorldConfig(**given)
     places = config.scenes * config.stations

@@ -18,7 +18,7 @@ class Serve(DecodeFlags, MapFlags):
     """Answer over HTTP, and in a browser, where photographs were taken."""
 
     host: str = "127.0.0.1"
-    """Name or address to listen on; any but this machine's own needs a token."""
+    """Name or address to listen on; one that other machines can reach needs a token."""
     port: int = 8000
     """Port to listen on; 0 is any free one."""
     token_file: pathlib.Path | None = None

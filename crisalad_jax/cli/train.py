@@ -55,11 +55,11 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     val_images: pathlib.Path | None = None
     """With a .mat file or .npy lists as --val: folder of their images; by default next to them."""
     weights: pathlib.Path | None = None
-    """Weights of a model to start from: a file, starter, or a published model's name. The run has
+    """Weights of a model to start from: a file, starter, or a published model's name. The run uses
     the file's model, preprocessing and image size, unless flags or --config say otherwise."""
     backbone: pathlib.Path | None = None
-    """Start from only this backbone: a file of this package, any checkpoint that `convert` reads,
-    or a published model's name, as in dinov2-vitb14."""
+    """Start from only this backbone: a weight file of this package, any checkpoint that `convert`
+    reads, or a published model's name, as in dinov2-vitb14."""
     preset: str = "b14"
     """Size of the model, which other flags can change: tiny, s14, b14, l14 or g14. With --weights
     it is the file's."""
@@ -111,7 +111,7 @@ def parse(program: str, arguments: Sequence[str]) -> Train:
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
-    """Return the arguments, with a name as --weights made a path: the model determines flags.
+    """Return the arguments, with the name of a model in --weights replaced by its path.
 
     Raises:
         InputError: the weights cannot be found or read; or several processes would download and
@@ -163,7 +163,7 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
     file exists (`prepare` finds it). If --data names several sets, it has settings for each.
 
     Raises:
-        InputError: --config is given with --preset or --recipe, or what a flag names is missing.
+        InputError: --config is given with --preset or --recipe, or a given file or name is unknown.
     """
     given, data = find_flag(arguments, "--config"), flag_values(arguments, "--data")
     require(len(data) < 2, "--data: found twice, expected all sets after one: NAME=DIR NAME=DIR")

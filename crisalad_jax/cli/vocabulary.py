@@ -44,7 +44,7 @@ class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
 
 
 def run(arguments: Vocabulary) -> dict[str, Any]:
-    """Build the vocabulary, write the model, and print its size; return that for --json."""
+    """Build the vocabulary, write the model, and print its size; return the result for --json."""
     model = _model(arguments)
     built = build_vocabulary(
         model,

@@ -125,7 +125,7 @@ def check_types(config: Any) -> None:
     """Check that every field of a configuration holds a value of its annotated type.
 
     NumPy's numbers are accepted for Python's, and whole numbers for floats. Fields for parts are
-    left to `resolve_names`, and types that configurations do not use are not checked.
+    left to `resolve_names`. Type hints of a kind that no configuration uses accept any value.
 
     Args:
         config: the configuration, a dataclass, which calls this in its `__post_init__`.

@@ -33,7 +33,7 @@ class ClassesConfig:
     """Width of a sector of headings in degrees, CosPlace's alpha."""
     spacing: PositiveInt = 5
     """Distance in cells between neighbouring classes of a group, CosPlace's N; EigenPlaces' is 3.
-    Places of a group are not marked as near each other; without marks, over N - 1 cells apart."""
+    No two "places" of a group are marked as near or, in a set without marks, within N - 1 cells."""
     sector_spacing: PositiveInt = 2
     """Distance in sectors between neighbouring classes of a group, CosPlace's L."""
     focal_distance: PositiveFloat = 10.0

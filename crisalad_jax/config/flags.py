@@ -80,7 +80,7 @@ def _flags_of_each(configs: Sequence[Any], arguments: Sequence[str], preset: str
 
 
 def config_of(flags: Any) -> Any:
-    """Make the configuration from a stand-in of `flags_of` that tyro has filled in.
+    """Make the configuration from a stand-in that `flags_of` made and tyro has filled in.
 
     Raises:
         InputError: the configuration's own checks reject a value.

@@ -19,7 +19,7 @@ from crisalad_jax.utils.files import read_json
 
 _T = TypeVar("_T")
 PLUGIN = "plugin"
-"""Key of the plug-in that registered a part, next to its name."""
+"""Key, next to a part's name, for the plug-in that registered the part."""
 
 
 def to_plain(config: Any) -> Any:
@@ -28,7 +28,7 @@ def to_plain(config: Any) -> Any:
     Plug-ins' parts also have the plug-in's name, so that messages can name a missing plug-in.
 
     Raises:
-        InputError: a value is not None, a number, text or a list of these.
+        InputError: a value is not None, a boolean, a number, text or a list of these.
     """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
         fields = {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}

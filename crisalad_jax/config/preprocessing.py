@@ -16,7 +16,7 @@ BitDepth = Literal["high-byte", "contrast-stretch"]
 LocalFeatures = Literal["sift", "orb"]
 """Kinds of hand-crafted local features that can replace the pixels as a model's input."""
 FEATURE_BYTES: Mapping[str, int] = {"sift": 129, "orb": 33}
-"""Bytes per local feature, by kind: its descriptor, then a byte of 1, or 0 for no feature."""
+"""Bytes per local feature, by kind: its descriptor, then one byte, which is 1, or 0 in padding."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
@@ -38,8 +38,8 @@ class PreprocessingConfig:
     """How a photograph is resized and normalised for a network.
 
     Published models differ in these settings, which change descriptors (docs/resizing.md). The
-    defaults are torchvision's `Resize`, `ToTensor` and `Normalize` on Pillow images. For "floats",
-    normalising before or after the resize is the same, because the filter's weights sum to 1.
+    defaults are torchvision's `Resize`, `ToTensor` and `Normalize` on Pillow images. With "floats"
+    pixels, normalising before or after the resize is equivalent: the filter's weights sum to 1.
 
     Example:
         >>> chain = PreprocessingConfig(filter="bicubic", pixels="floats")
@@ -58,7 +58,7 @@ class PreprocessingConfig:
     filter: Literal["bilinear", "bicubic", "area"] = non_semantic_field("bilinear")
     """Resize filter; "area" is OpenCV's INTER_AREA (if a side grows, INTER_LINEAR), as in hloc."""
     antialias: bool = non_semantic_field(True)
-    """Whether the filter widens when an image shrinks, as in Pillow; "area" ignores it."""
+    """Whether the filter widens when an image shrinks, as in Pillow; no effect on "area"."""
     pixels: Literal["bytes", "floats"] = non_semantic_field("bytes")
     """Type of the resized pixels: "bytes" are rounded to 8 bits, as in Pillow; "floats" are neither
     rounded nor clamped, as in torch."""
@@ -67,12 +67,12 @@ class PreprocessingConfig:
     nearest multiple of the patch size (halves to even), as MegaLoc does."""
     bit_depth: BitDepth = non_semantic_field("high-byte")
     """How colours of more than 8 bits are reduced to 8, before the resize. "high-byte" drops the
-    low byte of 16 bits. "contrast-stretch" maps the 1st to the 99th percentile of each image's
-    values to 0 to 255: for thermal images, whose values fill a small part of 16 bits, and for
-    floats. 8-bit images do not change."""
+    low byte of 16 bits. "contrast-stretch" maps each image's 1st percentile to 0 and its 99th to
+    255: for thermal images, whose values fill a small part of 16 bits, and for floats. 8-bit images
+    do not change."""
     normalisation: Literal["mean-deviation", "local-contrast"] = "mean-deviation"
-    """How pixels are normalised: by `mean` and `deviation`, or by those of the 21 x 21 pixels
-    around each pixel."""
+    """How pixels are normalised: by `mean` and `deviation`, or ("local-contrast") by the mean and
+    deviation of the 21 x 21 pixels around each pixel."""
     mean: tuple[float, float, float] = IMAGENET_MEAN
     """Mean of red, green and blue, for pixels from 0 to 1; by default ImageNet's."""
     deviation: tuple[float, float, float] = IMAGENET_DEVIATION
@@ -157,10 +157,10 @@ class PreprocessingConfig:
         return dataclasses.replace(self, size_rule="fixed", pixels="bytes", antialias=True)
 
     def changed_by(self, words: Sequence[str]) -> "PreprocessingConfig":
-        """Return this configuration changed by `words`: values of `--resize`, keys of `WORDS`.
+        """Apply `words`, values of `--resize` (keys of `WORDS`); return the new configuration.
 
         Raises:
-            InputError: an unknown value, two values for one field, or a value without effect.
+            InputError: a word is unknown, contradicts another word, or has no effect.
 
         Example:
             >>> PreprocessingConfig().changed_by(["native", "bicubic"]).filter

@@ -1,4 +1,4 @@
-"""Registries of parts (swappable classes, see `Part`) by name, built-in or of plug-ins."""
+"""Registries of parts (swappable classes, see `Part`), built in or from plug-ins, by name."""
 
 import dataclasses
 import functools
@@ -34,11 +34,11 @@ class Registry(Generic[P]):
         """Create the registry of one kind of part, and set `base.registry` to it.
 
         Args:
-            kind: what messages call a part of this kind, such as "aggregator".
+            kind: name of this kind of part in `REGISTRIES` and messages, such as "aggregator".
             base: the class that all parts of this kind inherit from.
-            of_function: returns the methods, by name, of the part that wraps a plain function; None
-                if parts of this kind cannot be plain functions.
-            find_other: returns the class for a name that is not registered, or None.
+            of_function: function that returns the methods, by name, of the part that wraps a given
+                plain function; None if parts of this kind cannot be plain functions.
+            find_other: function that returns the class for a name that is not registered, or None.
             others: what messages and help call the names that `find_other` accepts ("optax.NAME").
         """
         self.kind, self.base, self._of_function = kind, base, of_function
@@ -51,16 +51,16 @@ class Registry(Generic[P]):
     def register(self, name: str, **presets: Mapping[str, Any]) -> Callable[[_C], _C]:
         """Return a decorator that registers a class, or a plain function, under `name`.
 
-        A class that is not a dataclass yet becomes a frozen one.
+        A class that is not a dataclass yet becomes a frozen dataclass.
 
         Args:
             name: name of the part in configurations, files and flags.
-            **presets: for each preset of model sizes, by name, the values of the fields that differ
-                from the part's defaults.
+            **presets: fields that differ from the part's defaults, for each preset of model sizes,
+                as in `tiny={"depth": 4}`.
 
         Raises:
-            InputError: a name with ':' or ','; when decorating, a taken name or a part that does
-                not fit this kind.
+            InputError: `name` is empty or contains ':' or ','; or, when decorating, the name is
+                taken or the part does not fit this kind.
         """
         where = f"register_{self.kind}"
         require(
@@ -178,7 +178,7 @@ class Registry(Generic[P]):
             where: what messages call the value, such as "ModelConfig.aggregator".
 
         Raises:
-            InputError: a name that is not registered, or a value that is not a part of this kind.
+            InputError: `value` is a name that is not registered, or is not a part of this kind.
         """
         if isinstance(value, str):
             return self.find(value, where=where)()
@@ -202,7 +202,7 @@ def make_part(kind: str, name: str, **settings: Any) -> Any:
         The part, to pass as the configuration's field for that kind.
 
     Raises:
-        InputError: no such kind, part or setting, or a value that does not fit.
+        InputError: there is no such kind, part or setting, or a value does not fit.
 
     Example:
         >>> from crisalad_jax import OptimiserConfig
@@ -223,7 +223,7 @@ def make_part(kind: str, name: str, **settings: Any) -> Any:
 
 
 def add_named(kind: str, table: dict[str, Any], name: str, value: Any) -> None:
-    """Add `value`, a class or function, to a dictionary of names, for `register_{kind}`.
+    """Add `value`, a class or function, to `table` under `name`; `kind` is for messages.
 
     Raises:
         InputError: the name is taken by a class or function of another module.
@@ -250,8 +250,8 @@ def resolve_names(config: Any) -> None:
     """Check the field types of a new configuration, and replace names of parts with the parts.
 
     Raises:
-        InputError: a name that is not registered, a value that is not a part of the field's kind,
-            or another value that is not of its field's type.
+        InputError: a name is not registered, a part is not of its field's kind, or another value is
+            not of its field's type.
     """
     check_types(config)
     for field in dataclasses.fields(config):
@@ -275,8 +275,8 @@ def with_arguments(*offered: str) -> Callable[[Callable[..., Any]], Mapping[str,
 def count_arguments(function: Callable[..., Any], *offered: str) -> int:
     """Return how many of the offered arguments, in their order, a plain function takes.
 
-    A function takes those that it requires, and those whose names match the offered ones. Any other
-    parameter, such as `temperature=0.1`, keeps its default.
+    A function takes the arguments that it requires, and those whose names match the offered ones.
+    Any other parameter, such as `temperature=0.1`, keeps its default.
 
     Raises:
         InputError: the function requires more arguments than are offered.

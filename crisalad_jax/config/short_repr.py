@@ -30,14 +30,14 @@ _STYLE = "__crisalad_style__"
 
 
 def short_repr(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]], type[_T]]:
-    """Return a decorator that gives a configuration class the `repr` of `concise_repr`.
+    """Return a decorator that makes `concise_repr` the `repr` of a configuration class.
 
     The `help` of the class then shows the docstrings below its fields, too.
 
     Args:
         *always: names of fields that are printed even at their defaults.
-        switch: a field, its value that makes other fields unused, and their names (without names,
-            all others). Unused fields are neither printed nor compared (`config.io.differences`).
+        switch: a field, the value at which it makes others unused, and their names (if omitted, all
+            others). Unused fields are neither printed nor compared (`config.io.differences`).
     """
     return lambda cls: _print_in(_Style(always, switch), cls)
 
@@ -94,7 +94,7 @@ def concise_repr(value: Any) -> str:
 
 
 def in_one_line(value: Any) -> str:
-    """Format any value for a message: a configuration in one line, others by their first line."""
+    """Format any value for a message: a configuration in one line, others as their first line."""
     first, *more = _write(value, math.inf).splitlines() or [""]
     return f"{first} ..." if more else first
 
@@ -193,7 +193,7 @@ def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
 
 
 def with_field_docs(cls: type[_T]) -> type[_T]:
-    """Append the docstrings below a class's fields to its `help`, and return the class."""
+    """Add the docstrings of a class's fields to what `help(cls)` shows, and return the class."""
     doc = _Doc(cls.__doc__ or "")
     doc.kind = cls
     cls.__doc__ = doc
@@ -221,7 +221,7 @@ class _Doc(str):
 
 @functools.cache
 def field_docs(kind: type) -> Mapping[str, str]:
-    """Return the docstrings below a dataclass's or NamedTuple's fields, also inherited, by name."""
+    """Return the docstrings of a dataclass's or NamedTuple's fields, inherited or not, by name."""
     docs: dict[str, str] = {}
     for each in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(each) and not hasattr(each, "_fields"):

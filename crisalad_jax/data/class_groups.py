@@ -35,7 +35,7 @@ class Views(NamedTuple):
     heading: Float64[np.ndarray, " images"]
     """Heading in degrees clockwise from north, 0 to 360; NaN where unknown."""
     known: Bool[np.ndarray, " cities"]
-    """Whether a city's positions are real; False if all its images have the same one."""
+    """Whether a city's positions are real; False if all its images have the same position."""
 
 
 def views_of(places: Places) -> Views:
@@ -69,7 +69,7 @@ def known_views(places: Places, what: str, *, headings: bool) -> Views:
     """Return `views_of` a set if all images have a position and, with `headings`, a heading.
 
     Raises:
-        InputError: some have none (the message names `what`, which needs it); or too wide a city.
+        InputError: an image lacks one (the message says `what` needs it), or a city is too wide.
     """
     views = views_of(places)
     needed, column = ("headings, or no positions", ",heading") if headings else ("positions", "")

@@ -2,7 +2,7 @@
 
 A frame of a video is named `walk.mp4#t=12.500`, with its time in seconds. A frame of a log (a ROS
 bag) is named `walk.mcap#/camera/image_raw#t=1700000000.123456789`, with its topic and time stamp.
-Such names are accepted wherever the path of an image is.
+Such names are accepted wherever the path of an image is accepted.
 """
 
 import collections
@@ -32,7 +32,7 @@ _UNIX = 1_000_000_000
 
 
 class FrameName(NamedTuple):
-    """The parts of a frame's name; the time is from a video's start, or a log's time stamp."""
+    """The parts of a frame's name; the time counts from a video's start, or is a log's stamp."""
 
     file: str
     """The video or log."""
@@ -73,7 +73,7 @@ def has_frames(path: str | os.PathLike[str]) -> bool:
 
 
 def parse_frame(path: str | os.PathLike[str]) -> FrameName | None:
-    """Parse a frame's name, whatever the decimals of its time; return None for other names.
+    """Parse a frame's name, with any number of decimals in its time; return None for other names.
 
     Example:
         >>> parse_frame("walk.bag#/camera#t=1700000000.5")
@@ -101,7 +101,7 @@ def frame_name(video: str | os.PathLike[str], milliseconds: int) -> str:
 
 
 def spelled(name: str) -> str:
-    """Return a frame's name in its standard spelling; other names unchanged.
+    """Return a frame's name in its standard spelling, and other names unchanged.
 
     Example:
         >>> spelled("walk.mp4#t=12.5"), spelled("a.jpg")
@@ -198,7 +198,7 @@ class Moment(NamedTuple):
 
 
 def moment_of(name: str | os.PathLike[str]) -> Moment | None:
-    """Read the time in an image's name; None if it has none, or several.
+    """Read the time in an image's name; None if the name has no time, or several.
 
     Example:
         >>> moment_of("walk.mp4#t=12.500")

@@ -104,9 +104,9 @@ def read_image(
         The image, in red, green and blue.
 
     Raises:
-        InputError: the file is missing, a folder, empty, cut short (part of an image is never
-            returned), larger than 2**28 pixels (OPENCV_IO_MAX_IMAGE_PIXELS) or in another format;
-            floats or signed integers without "contrast-stretch"; or a `size` without pixels.
+        InputError: the file is missing, a folder, empty, cut short (no partial image is returned),
+            larger than 2**28 pixels (OPENCV_IO_MAX_IMAGE_PIXELS) or in another format; it has
+            floats or signed integers without "contrast-stretch"; or a side of `size` is below 1.
 
     Example:
         >>> read_image(pictures / "0.png").shape
@@ -155,7 +155,7 @@ def decode_image(
         have more than 8 bits, which `prepare_image` reduces to 8 by the model's configuration.
 
     Raises:
-        InputError: `data` is empty, cut short, too large an image, or in another format.
+        InputError: `data` is empty, cut short, or in another format, or the image is too large.
     """
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
     # libjpeg write warnings to stderr that OpenCV's log level does not silence.

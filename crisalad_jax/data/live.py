@@ -40,7 +40,7 @@ class Frame(NamedTuple):
     name: str
     """Path of the file relative to the folder, or name of the camera or video and the time."""
     time: float
-    """Seconds from a video's start; else since 1970: a file's last change, or the frame's stamp."""
+    """Seconds from a video's start, or since 1970: a file's last change, or the frame's stamp."""
     image: np.ndarray
     """RGB or grey, upright, at the file's bit depth; 8 bits from a camera."""
     taken: float
@@ -94,7 +94,7 @@ class FolderWatch:
                     yield pathlib.Path(parent, name)
 
     def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
-        """Yield images as they appear, without end; of several, the oldest first.
+        """Yield images as they appear, without end, the oldest of several first.
 
         Args:
             check: called several times a second; it may raise to end the loop.
@@ -194,7 +194,7 @@ class LatestFrame:
             image: 8-bit RGB (height, width, 3), or anything else that `prepare_image` takes. It
                 must not change afterwards.
             stamp: time of the image in seconds, for example since 1970.
-            name: name of the image in answers; None makes one of "camera" and the time.
+            name: the frame's name (`Frame.name`); None makes one from "camera" and the time.
         """
         taken = time.perf_counter()
         name = frame_name("camera", round(1000 * stamp)) if name is None else name
@@ -267,7 +267,7 @@ class Camera(LatestFrame):
             camera: number of the camera from 0, a URL, a video file, or a robot log (a ROS bag).
             fps: maximum frames per second that `frames` yields; None yields as many as requested.
             rate: speed at which a file plays, as a multiple of the recorded speed.
-            topic: topic of the images in a robot log; None takes the only one that has any.
+            topic: topic of the images in a robot log; None takes the only topic that has images.
 
         Raises:
             InputError: the camera cannot be opened, or gives no frame; `fps` or `rate` is out of

@@ -34,7 +34,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 BATCHES_AHEAD = 2
 THREADS = usable_cores()
-"""One per core, as OpenCV releases the GIL: two cores decode about 500 photographs a second."""
+"""One thread per core, as OpenCV releases the GIL: two decode about 500 photographs a second."""
 
 
 _SMALL = 16
@@ -48,8 +48,8 @@ class ImageBatch(NamedTuple):
     images: UInt8[np.ndarray, "batch h w 3"] | Float32[np.ndarray, "batch h w 3"]
     """8-bit pixels, or normalised floats; zeros where not valid."""
     labels: Int32[np.ndarray, " batch"]
-    """Index of the image's place (or group); for mined tuples, tuple and role in one number
-    (`losses.pairs.tuple_labels`); otherwise, index in the list of paths. -1 for padding."""
+    """In training, index of the image's place or group, or, for mined tuples, tuple and role in one
+    number (`losses.pairs.tuple_labels`); otherwise, index in the list of paths. -1 for padding."""
     valid: Bool[np.ndarray, " batch"]
     indices: Int64[np.ndarray, " batch"]
     """Index of the image in its set or list, also for unreadable images; -1 for padding."""
@@ -171,7 +171,7 @@ class Reading:
 
         If prepared images differ in size, a batch holds consecutive images of one size, and every
         change of size ends and pads a batch: if most sizes differ, a `batch_size` of 1 saves work.
-        Under "skip", an unreadable image is not valid but has its index.
+        Under "skip", an unreadable image is marked as not valid, but has its index.
 
         Args:
             paths: the image files.
@@ -200,7 +200,7 @@ class Reading:
         has_frames: bool,
         far: bool,
     ) -> Iterator[ImageBatch]:
-        """Yield batches of the images that `load` returns for `slots`, with indices and labels.
+        """Yield batches of the images `load(slot)` for `slots`, with their `indices` and `labels`.
 
         A batch holds the next `batch_size` images, or fewer if the size changes. With `has_frames`
         at most one thread reads, because each would read the video from its beginning. Remote

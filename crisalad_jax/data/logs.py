@@ -86,7 +86,7 @@ class _Frames(NamedTuple):
 
 
 class Log:
-    """A robot log: its topics, the images of one, and the positions of another.
+    """A robot log: its topics, the images of one topic, and the positions of another.
 
     Stamps are nanoseconds since 1970: from the message's header or, if that has none, the time of
     logging. Only stamps and positions stay in memory, and threads may share a log.
@@ -101,7 +101,7 @@ class Log:
                 count = each.msgcount + (found[each.topic].count if each.topic in found else 0)
                 found[each.topic] = Topic(each.topic, each.msgtype, count)
         self.topics: Sequence[Topic] = sorted(found.values())
-        """All topics, by name."""
+        """All topics, sorted by name."""
         self._lock = threading.RLock()
         self._rows: dict[str, list[tuple[float, ...]]] = {}
         self._known: dict[str, _Frames] = {}
@@ -118,7 +118,7 @@ class Log:
             name: the topic's name; None takes the only one that has images.
 
         Raises:
-            InputError: no such topic, one without images, or several and no name.
+            InputError: there is no such topic with images, or several and `name` is None.
         """
         found = self._topics(_IMAGES)
         if name is None and len(found) == 1:
@@ -132,8 +132,8 @@ class Log:
         """Return the name of the topic that positions are taken from; None if there is none.
 
         Args:
-            name: the topic's name, or "none". None takes the only one of NavSatFix or, without any
-                of that type, of odometry or poses; if there are several, none, with a warning.
+            name: the topic's name; "none" takes none. None takes the only topic of NavSatFix or,
+                without any of that type, of odometry or poses; of several it takes none, and warns.
 
         Raises:
             InputError: the log has no such topic, or the topic has no positions.
@@ -167,7 +167,7 @@ class Log:
         return InputError(f"{self.path}: found {words}")
 
     def images(self, topic: str | None = None) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield the stamp and the pixels of every image of a topic, in the log's order.
+        """Yield the stamp (in nanoseconds) and pixels of each image of a topic, in the log's order.
 
         Args:
             topic: see `image_topic`.
@@ -181,7 +181,7 @@ class Log:
             yield stamp, decode_message(message, str(FrameName(str(self.path), name, stamp)))
 
     def stamps(self, topic: str) -> Int64[np.ndarray, " n"]:
-        """Return the stamps of a topic's images, sorted and unique; warn if they were not.
+        """Return a topic's image stamps in nanoseconds, sorted and unique; warn if they were not.
 
         Raises:
             InputError: the log cannot be read.
@@ -189,7 +189,7 @@ class Log:
         return self._frames(topic).stamps
 
     def read(self, topic: str, stamp: int, *, enough: tuple[int, int] | None = None) -> np.ndarray:
-        """Read the first image of a topic at or after a stamp, as `read_pixels` reads a file.
+        """Read a topic's first image at or after a stamp in nanoseconds, as `read_pixels` does.
 
         Raises:
             InputError: there is no such image, or it cannot be decoded.
@@ -302,13 +302,13 @@ class Log:
 
 
 def open_log(path: str | os.PathLike[str]) -> Log:
-    """Open a robot log; the last two are cached until their files change.
+    """Open a robot log; the two opened last are cached until their files change.
 
     Args:
         path: a ROS 1 bag (.bag), or a ROS 2 bag: a file .mcap or .db3, or its folder.
 
     Raises:
-        InputError: no such file, an incomplete one, or the extra `robot` is not installed.
+        InputError: the file is missing or incomplete, or the extra `robot` is not installed.
     """
     path = pathlib.Path(path)
     if not path.is_dir():
@@ -383,11 +383,11 @@ def decode_message(
         enough: see `read_image`.
 
     Returns:
-        RGB, or grey (height, width), of 8 bits, or of the depth of encodings such as `mono16`.
+        RGB (height, width, 3) or grey (height, width); 8 bits, or more as in `mono16`.
 
     Raises:
-        InputError: an unknown encoding, fewer bytes than the image needs, or compressed data that
-            does not decode.
+        InputError: the encoding is unknown, there are fewer bytes than the image needs, or
+            compressed data does not decode.
 
     Example:
         >>> import types
@@ -443,7 +443,7 @@ class ListedFrames(NamedTuple):
 
     paths: list[pathlib.Path]
     there: int
-    """Number of all frames of the topic, also of those not taken."""
+    """Number of all frames of the topic, including those not taken."""
     positions: Positions | None
     """Positions of these frames by path; None if the log has none."""
 

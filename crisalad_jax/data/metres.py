@@ -37,7 +37,7 @@ _Points = Float64[np.ndarray, " point"]
 
 
 class Zone(NamedTuple):
-    """A zone of UTM and a hemisphere, which share one plane of metres."""
+    """A UTM zone in one hemisphere; its positions are metres in one plane."""
 
     number: int
     south: bool
@@ -135,7 +135,7 @@ def on_ellipsoid(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "
 
 
 def flattened(points: Float64[np.ndarray, "point axis"]) -> Float64[np.ndarray, "point 2"]:
-    """Return points for a drawn map: east and north unchanged, ellipsoid points equirectangular."""
+    """Return points for a map plot: east and north unchanged, ellipsoid points equirectangular."""
     if points.shape[1] == 2:
         return points
     x, y, z = points.T

@@ -58,7 +58,7 @@ class FoundPlace(NamedTuple):
     images: Mapping[str, View | None]
     """View of each image by its path relative to the root; None if its position is unknown."""
     near: Sequence[int] = ()
-    """Indices of places that are too close to share a batch with it."""
+    """Indices of places that are too close to share a batch with this one."""
     city: int = 0
 
 
@@ -70,7 +70,7 @@ def read_gsv_cities(
     Images may end in .jpg or .JPG, and may be in a folder named after the city id or the CSV file.
 
     Raises:
-        InputError: a city that is unknown or named twice, a bad row, or a row without its image.
+        InputError: a city is unknown or named twice, a row is not valid, or its image is missing.
     """
     folder = root / "Dataframes"
     paths = (folder / name for name in sorted(list_names(folder)))
@@ -180,7 +180,7 @@ def read_named_places(
         places, ordered by city.
 
     Raises:
-        InputError: it is none of these, the table is not valid, or an image is missing.
+        InputError: `root` is none of these, the table is not valid, or an image is missing.
     """
     if is_file(root / TABLE):
         root = root / TABLE

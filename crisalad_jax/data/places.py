@@ -55,7 +55,7 @@ class Places:
     views: Float64[np.ndarray, "images 3"] | None = None
     """Latitude, longitude and heading of each image in degrees; NaN for an unknown heading."""
     near: tuple[Int64[np.ndarray, " _"], ...] | None = None
-    """For each place, the places too close to share a batch with it; None if any two may."""
+    """For each place, the places too close to share a batch with it; None if any two places may."""
 
     @property
     def image_counts(self) -> Int64[np.ndarray, " places"]:
@@ -80,7 +80,7 @@ class JoinedPlaces:
 
     @functools.cached_property
     def starts(self) -> Int64[np.ndarray, " sets+1"]:
-        """Index of each set's first image, and the number of all images."""
+        """Index of each set's first image, then the total number of images."""
         return np.cumsum([0, *(len(each.files) for each in self.sets)], dtype=np.int64)
 
     @property
@@ -107,15 +107,15 @@ def read_places(
     topic: str | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> Places:
-    """Read training places in the layout of GSV-Cities, of MSLS or a custom one, or group images.
+    """Read training places in a layout (GSV-Cities, MSLS or custom), or group images into places.
 
     `place_radius` or `place_frames` groups the images of any source into places, by position or
     order. Such places that are too close to tell apart (`Places.near`) never share a batch.
 
     A custom layout is a folder in which each folder with images is a place; or a table with the
-    columns `name,place` and, if known, `lat,lon`, `heading` (all in degrees) and `city`: a file, or
-    `places.csv` in the folder. Names are relative to the table. With several cities, or scenes, in
-    a table, names of places only need to be unique within each.
+    columns `name,place` and, if known, `lat,lon`, `heading` (all in degrees) and `city`. The table
+    is `root` itself, or `places.csv` in `root`. Names are relative to the table. With several
+    cities, or scenes, in a table, names of places only need to be unique within each.
 
     Places of MSLS are the clusters of its tables (`unique_cluster`), with the images of the
     database and of the queries, without panoramas.
@@ -129,7 +129,7 @@ def read_places(
             source of images (`open_source`).
         cities: names of CSV files without the suffix, or of MSLS's folders; None reads all, or for
             MSLS those of its training set.
-        min_images: minimum images per place; a warning counts places left out.
+        min_images: places with fewer images are left out, and a warning counts them.
         place_radius: radius of a place in metres. In order, each image that is farther than this
             from all previous centres becomes a centre; then each image joins the place with the
             nearest centre. Centres in a batch are more than four radii apart.
@@ -146,9 +146,9 @@ def read_places(
         The places, with their image files.
 
     Raises:
-        InputError: none of these layouts, an unknown or repeated city, a CSV without a column or
-            with a field that is not a number, a missing image, no place large enough, no position,
-            or conflicting arguments.
+        InputError: `root` has none of these layouts; a city is unknown or repeated; a table lacks a
+            column or has a field that is not a number; an image is missing; no place has enough
+            images; no image has a position; or arguments conflict.
 
     Example:
         >>> read_places(places, min_images=3).image_counts.tolist()

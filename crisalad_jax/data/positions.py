@@ -57,8 +57,8 @@ class Positions(NamedTuple):
     ) -> "Positions":
         """Return the positions in the axes and zone of a map.
 
-        Metres of another zone, or degrees, become metres of the map's zone, and metres become
-        degrees in a map of degrees, all to a tenth of a millimetre.
+        For a map in metres, degrees and metres of another zone become metres of its zone; for a map
+        in degrees, metres become degrees. Results are rounded to a tenth of a millimetre.
 
         Args:
             source: the map, for messages.
@@ -149,7 +149,7 @@ def utm_degrees(
     """Convert east and north in metres to latitude and longitude, each image in its `zones`.
 
     Raises:
-        InputError: metres out of range.
+        InputError: metres are out of UTM's range.
     """
     degrees = np.empty_like(metres)
     off = (np.abs(metres - [5e5, 5e6]) > [1e6, 5.1e6]).any(axis=1)
@@ -190,8 +190,8 @@ def positions_of(
     """Return given positions, or those of a file, under the names that images have on disk.
 
     Args:
-        given: positions by name, or the file of a table with a position in every row; positions of
-            other images stay. Or positions by time: a track or its file (`read_track`).
+        given: positions by name, or a table file with a position in every row (those of other
+            images are returned too); or positions by time: a track or its file (`read_track`).
         names: names of the images.
         paths: the files of the images, in the order of `names`.
         images: folder of the images, for messages.
@@ -385,7 +385,7 @@ def _degrees(fields: dict[int, Any], reference: int, value: int, signs: bytes) -
 
 
 def exif_positions(images: Iterable[tuple[str, pathlib.Path]]) -> Positions:
-    """Read the positions in the EXIF data of images; images without one are absent.
+    """Read the positions in the EXIF data of images; images without a position are absent.
 
     Args:
         images: name and file of each image.

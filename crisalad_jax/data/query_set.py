@@ -62,8 +62,8 @@ def read_query_set(
         The set, without the queries that have no positive.
 
     Raises:
-        InputError: `open_benchmark` cannot read the set; it has neither positions nor ground truth,
-            or no query has positives and negatives.
+        InputError: `open_benchmark` cannot read the set; the set has neither positions nor ground
+            truth; or no query has positives and negatives.
 
     Example:
         >>> import shutil

@@ -39,7 +39,7 @@ def is_remote(path: str | os.PathLike[str]) -> bool:
 
 
 def address_of(path: str | os.PathLike[str]) -> str:
-    """Return the address that a path represents; other paths unchanged.
+    """Return the address that a path represents; return other paths unchanged.
 
     Example:
         >>> address_of(pathlib.Path("s3://bucket/a.jpg"))
@@ -132,14 +132,14 @@ def size_of(path: pathlib.Path) -> int | None:
 
 
 def is_file(path: pathlib.Path) -> bool:
-    """Return whether a local or remote file exists; raises like `size_of`."""
+    """Return whether a local or remote file exists; raise InputError as `size_of` does."""
     if not is_remote(path):
         return path.is_file()
     return bool(_if_there(path, lambda files, there: files.info(there)["type"] == "file"))
 
 
 def is_folder(path: pathlib.Path) -> bool:
-    """Return whether a folder exists (if remote, with something in it); raises like `size_of`."""
+    """Return whether a folder exists (if remote, not empty); raise InputError as `size_of` does."""
     return bool(list_names(path)) if is_remote(path) else path.is_dir()
 
 

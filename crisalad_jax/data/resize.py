@@ -50,7 +50,7 @@ def resize_image(
         The image at that size, of uint8 or float32.
 
     Raises:
-        InputError: another type or shape of image, a side without pixels, or an unknown option.
+        InputError: `image` has another type or shape, a side is below 1, or an option is unknown.
 
     Example:
         >>> import numpy as np

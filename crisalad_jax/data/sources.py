@@ -88,7 +88,7 @@ class ImageSource(NamedTuple):
         return found if found.of else exif_positions(pictures)
 
     def spaced(self, positions: Positions, metres: float) -> Self:
-        """Leave out images closer than `metres` to the previous remaining one of their sequence.
+        """Leave out images closer than `metres` to the last one retained of the same sequence.
 
         A sequence is the images of a folder, a video or a topic of a log, in order. Images without
         a position stay.
@@ -153,8 +153,8 @@ def open_source(
         out of that folder, to the root of the file system).
 
     Raises:
-        InputError: no such source, no image in it, a repeated path, or a file that is missing or
-            whose name does not fit in one line of text.
+        InputError: the source is missing or has no image; a path is repeated; a file is missing; or
+            a name does not fit in one line of text.
     """
     if not os.fspath(images):
         raise InputError(f"images: found an empty name, expected {_FORMS}")
@@ -206,7 +206,7 @@ def open_sources(
     """List the images of one or several sources, each as `open_source` does.
 
     Raises:
-        InputError: no source, an option without effect, or a source that `open_source` refuses.
+        InputError: no source is given, an option has no effect, or `open_source` refuses a source.
     """
     given = [images] if isinstance(images, str | os.PathLike) else list(images)
     if not given:
@@ -224,7 +224,7 @@ def join_sources(sources: Sequence[ImageSource]) -> ImageSource:
         sources: sources from `open_sources`.
 
     Returns:
-        A single source as it is. Images of several sources appear once each, named relative to a
+        A single source, unchanged. Images of several sources appear once each, named relative to a
         common folder, and have positions if all known positions share their axes and zone.
 
     Raises:

@@ -1,6 +1,6 @@
 """Read CSV tables, and match the image names in tables and lists to files on disk.
 
-Names may differ: Windows writes backslashes, and macOS writes accents as separate characters (NFD).
+Spellings differ: Windows writes backslashes, and macOS writes accents as separate characters (NFD).
 """
 
 import collections
@@ -82,7 +82,7 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A CSV file without its blank rows."""
+    """A CSV file without its blank rows; `has_commas` is that of each `Row`."""
 
     path: pathlib.Path
     columns: list[str]
@@ -99,7 +99,7 @@ class Table(NamedTuple):
             must: whether positions are required.
 
         Raises:
-            InputError: both east,north and lat,lon; half of such a pair; or none if `must`.
+            InputError: the table has both east,north and lat,lon, half of one, or none if `must`.
         """
         # x and y may be anything, such as pixels, and count only if there is no other pair.
         begun = [axes for axes in AXES[:2] if set(axes) & set(self.columns)]
@@ -124,7 +124,7 @@ class Table(NamedTuple):
         """Yield the name and row of each image, with frames of videos named as in `data.frames`.
 
         Raises:
-            InputError: a row has no name, or that of an earlier row, compared by `normal_name`.
+            InputError: a row has no name, or the name of an earlier row (by `normal_name`).
         """
         lines: dict[str, int] = {}
         for row in self.rows():
@@ -149,8 +149,8 @@ def read_table(path: pathlib.Path, *needed: str, any_spelling: bool = False) -> 
             latitude; they are then renamed to name, lat, lon, east, north and time.
 
     Raises:
-        InputError: the file cannot be read, or lacks a required column or has one twice; or, while
-            its rows are read, one does not have as many fields as the first row.
+        InputError: the file cannot be read, lacks a required column, or (given `needed`) has a
+            column twice; or, while rows are read, a row has more or fewer fields than the first.
     """
     if not is_remote(path):
         check_source(path, "a table of UTF-8 CSV", largest=LARGEST)

@@ -53,7 +53,7 @@ class Track(NamedTuple):
 
         Returns:
             The positions, NaN before the first point and after the last one; and for each position
-            the seconds between the two track points around it, 0 at a point.
+            the seconds between the two track points around it, 0 at a point or outside the track.
 
         Example:
             >>> import numpy as np
@@ -101,7 +101,7 @@ def read_track(
         path: the file. A .gpx has track points with times. A .geojson or .json has lines with
             `coordTimes` or `times`, or points with `time`. A table has the columns time and
             lat,lon or east,north or x,y, or other usual names of these.
-        start_time: start and time zone of the images' video, if any: "2026-05-01T12:00:00+02:00".
+        start_time: when the images' video starts, with its time zone: "2026-05-01T12:00:00+02:00".
         time_offset: seconds that are added to the times of images, for cameras whose clock is wrong
             or shows local time: -7200 if it is two hours ahead of UTC.
 
@@ -109,8 +109,8 @@ def read_track(
         The track, which `index` takes as `positions`.
 
     Raises:
-        InputError: the file cannot be read; it has no points, points out of range or without times,
-            or times that go back; `start_time` has no zone, or `time_offset` is not finite.
+        InputError: the file cannot be read or has no points; a point has no time or is not in
+            range; times go back; `start_time` has no zone; or `time_offset` is not finite.
 
     Example:
         >>> text = "time,lat,lon\\n2026-05-01T10:00:00Z,52.2,21.0\\n2026-05-01T10:00:10Z,52.3,21.0"

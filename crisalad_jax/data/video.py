@@ -2,7 +2,7 @@
 
 Times are those in the file, so videos with a variable frame rate work too. Commands name a frame by
 its actual time in whole milliseconds, even if a user wrote a time between two frames: `frame_name`
-writes such a name, and `name_frame` makes it from the user's.
+writes such a name, and `name_frame` finds it for a time that a user wrote.
 """
 
 import bisect
@@ -40,7 +40,7 @@ def milliseconds_of(capture: cv2.VideoCapture) -> int:
 def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib.Path]:
     """List the first frame of a video at or after each multiple of 1 / fps seconds.
 
-    Times are read from the container; only the end is decoded, as a check, or all if that fails.
+    Times are read from the container. The end is decoded as a check; if that fails, everything is.
 
     Args:
         video: the file.

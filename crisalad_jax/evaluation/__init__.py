@@ -1,1 +1,1 @@
-"""Evaluation of descriptors: recall under each grouping of images into batches, and its leakage."""
+"""Evaluation of descriptors: recall and leakage under each grouping of images into batches."""

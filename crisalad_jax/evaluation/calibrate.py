@@ -46,8 +46,8 @@ def calibrate(
         benchmark: the evaluation set, for instance from `open_benchmark`.
         precision: share of the answers that must be correct, above 0 and at most 1.
         model: the model that made the map; None loads it from its recorded path (`Map.load_model`).
-        verify: how answers are verified. The number of inliers that they need is then measured, and
-            stored separately, instead of the similarity. None measures the similarity.
+        verify: how answers are verified. The threshold is then a number of inliers, which is stored
+            separately. None measures the similarity threshold, without verification.
         reading: how images are read.
 
     Returns:
@@ -55,7 +55,7 @@ def calibrate(
 
     Raises:
         InputError: no threshold reaches the precision with at least three answers (the map is then
-            unchanged); `model` is not the map's; or what `evaluate` raises.
+            unchanged); `model` is not the map's; or `evaluate` raises it.
 
     Example:
         >>> import jax, shutil
@@ -115,7 +115,7 @@ def calibrate(
 
 
 def operating_point_of(calibration: Calibration) -> OperatingPoint:
-    """Convert a calibration to an operating point; if verified, its similarities are inliers."""
+    """Convert a calibration to an operating point; with a verifier, its threshold is in inliers."""
     measured = {name: getattr(calibration, name) for name in _MEASURED}
     if calibration.verifier:
         measured["min_similarity"] = calibration.min_inliers

@@ -16,7 +16,7 @@ class Difference(NamedTuple):
     """The recall of a method minus that of a reference, as fractions of the same queries."""
 
     mean: float
-    """Difference of the mean recalls, each over all seeds of the method or the reference."""
+    """Mean recall over the seeds of the method, minus that over the seeds of the reference."""
     interval: Interval
     """95 % bootstrap interval of the difference, resampled over queries and seeds."""
 
@@ -35,9 +35,9 @@ def paired_difference(
     """Compute the difference of two recalls, and its 95 % interval by percentile bootstrap.
 
     Each resample draws queries and seeds with replacement, as many as there are. Both methods get
-    the same queries. They also get the same seeds, because two runs with one seed share initial
-    values and batches, whose effect then cancels. Queries with equal hits are drawn together from a
-    multinomial distribution, which is exact and whose cost does not grow with their number.
+    the same queries and, if `same_seeds`, the same seeds: two runs with one seed share initial
+    values and batches, whose effect then cancels. Queries with the same hits in all runs are drawn
+    together from a multinomial distribution: exactly, at a cost independent of their number.
 
     Args:
         hits: whether each query was a hit, for each seed of the method.
@@ -51,8 +51,8 @@ def paired_difference(
         The difference, positive if the method recalls more.
 
     Raises:
-        InputError: no queries or seeds, different numbers of queries, or with `same_seeds`
-            different numbers of seeds.
+        InputError: there are no queries or no seeds; the numbers of queries differ; or, with
+            `same_seeds`, the numbers of seeds differ.
 
     Example:
         >>> first, second = np.array([[True, True, True, False]]), np.array([[False] * 4])

@@ -60,28 +60,28 @@ def evaluate(
 ) -> list[GroupingResult]:
     r"""Measure Recall@1, 5, 10 and 20, precision and leakage of a model under each grouping.
 
-    A grouping says which images attend to each other in a cross-image encoder. A model without one
-    has a single grouping, `any`. Leakage is how much the other images of a batch reveal about the
-    place of an image. Whether two images show the same place is decided by the positions of the
-    benchmark or, without positions, by its ground truth. Images are read and turned into tokens
-    once; memory holds all tokens, and the descriptors of one grouping and seed at a time.
+    A grouping says which images attend to each other in a cross-image encoder. A model without this
+    encoder has a single grouping, `any`. Leakage is how much the other images of a batch reveal
+    about the place of an image. Whether two images show the same place is decided by the positions
+    of the benchmark or, without positions, by its ground truth. Images are read and turned into
+    tokens once; memory holds all tokens, and the descriptors of one grouping and seed at a time.
 
     Args:
-        model: a model from `load`, or a `Runtime`.
+        model: a model from `load`, a `Runtime` or a `Describer`.
         benchmark: the evaluation set.
         groupings: each as `Grouping.parse` reads it, such as "single"; or "published:NAME", where
             NAME is cricavpr, crisalad or sage, for the batches of that paper, followed by single
             images and by shuffled and masked batches of the same size.
         seed: seed of the first shuffle of the database; the queries use the next seed.
         seeds: number of shuffles of a grouping with `shuffled`, by `seed`, `seed` + 2 and so on.
-        pca: principal components that shorten the descriptors, fitted to other places.
+        pca: principal components that shorten the descriptors, fitted to images of other places.
         dtype: how descriptors are compared; "bits" compares their signs (`pack_bits`) by the
             Hamming distance.
         observe: called with the descriptors of each grouping's first seed; for bits, with unit
             vectors of the signs.
-        rerank: a second stage; each grouping then has a result without and one with it.
+        rerank: a second stage; each grouping then has two results, without and with this stage.
         precision: adds an `operating_point` to each result: the similarity threshold at which first
-            retrievals reach this precision, and the recall that remains.
+            retrievals reach this precision (above 0, at most 1), and the recall that remains.
         reading: how images are read; its batch size is the number of images that attend to each
             other, unless a grouping has its own. With `on_bad_image` "skip" the results are for the
             benchmark without unreadable images (`GroupingResult.skipped`).
@@ -90,11 +90,11 @@ def evaluate(
         A result for each grouping, and with `rerank` a second one.
 
     Raises:
-        InputError: parameters that do not fit the configuration; components of another model; bits
-            of a length that is not a multiple of 8; no ground truth; an unreadable image, or no
-            readable query or database image; a number out of range; an unknown grouping, or a
-            published one without batches for this set; or a second stage that does not fit
-            (`Reranking.check` and `stage`).
+        InputError: the parameters do not fit the configuration; `pca` was fitted to another model;
+            descriptors as bits have a length that is not a multiple of 8; there is no ground truth;
+            an image cannot be read, or no query or no database image can; a number is out of range;
+            a grouping is unknown, or a published one has no batches for this set; or the second
+            stage does not fit (`Reranking.check` and `stage`).
 
     Example:
         >>> import jax, shutil
@@ -176,7 +176,7 @@ def check_evaluation(
     """Check arguments of `evaluate`, and return the kinds of groupings in them, such as "single".
 
     Raises:
-        InputError: an unknown grouping, or a number out of range.
+        InputError: a grouping is unknown, or a number is out of range.
     """
     check_seed("seed", seed)
     check_count("seeds", seeds)

@@ -11,7 +11,7 @@ from crisalad_jax.retrieval.grouping import MASKED, Batches
 SamePlace = Callable[
     [Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]], Bool[np.ndarray, " pair"]
 ]
-"""Tests which pairs of queries, or of database images, show the same place; takes indices."""
+"""A test of which pairs of queries, or of database images, given by index, share a place."""
 
 # Elements in an array of pairs: tens of megabytes, for any number of images.
 _CHUNK = 2**21
@@ -29,11 +29,11 @@ def near(positions: Float64[np.ndarray, "image axis"], radius: float) -> SamePla
 def by_truth(
     positives: Sequence[Int64[np.ndarray, " _"]], database: int
 ) -> tuple[SamePlace, SamePlace]:
-    """Return tests of whether two queries, or two of the `database` images, show the same place.
+    """Return tests of whether two queries, or two of the database images, show the same place.
 
-    The tests use only ground truth: two queries show the same place if some database image is
-    correct for both, and two database images if both are correct for some query. An image without
-    a match in the ground truth shares its place with no other image, whatever it shows.
+    The tests use only ground truth: `positives`, the indices of each query's correct images among
+    `database` images. Two queries share a place if some image is correct for both, and two database
+    images if both are correct for some query. An image without a match shares its place with none.
     """
     truth = _truth(positives, database)
     return _sharing(truth), _sharing(truth.T.tocsr())
@@ -84,11 +84,11 @@ def mirrored_share(
 ) -> float | None:
     """Measure how closely a query's batch mirrors the batch of its correct answer, 0 to 1.
 
-    For a query and one of its positives, this is the share of the other queries in its batch that
-    have a positive in the batch of that positive; the positive with the largest share counts. It is
-    1 if queries and database have the same file order: both batches then show the same places, and
-    what their images share identifies that part of the sequence. The result is the mean over
-    queries with a positive that attend to others; None without any, or if a grouping is `single`.
+    For a query and one of its positives, this is the share of the other queries in the query's
+    batch that have a positive in the batch of that positive; the largest share counts. It is 1 if
+    queries and database have the same file order: both batches then show the same places, and what
+    their images share identifies that part of the sequence. The result is the mean over queries
+    with a positive that attend to others; None without such queries, or if a grouping is `single`.
     """
     if "single" in (queries.grouping, database.grouping):
         return None
@@ -116,7 +116,7 @@ def _sight(batches: Batches) -> scipy.sparse.csr_array:
 def same_place_share(batches: Batches, same: SamePlace) -> float | None:
     """Measure the share of same-place images among the others that an image attends to, 0 to 1.
 
-    The result is the mean over images that attend to another one; None if none does.
+    The result is the mean over images that attend to another image; None if no image does.
     """
     if batches.grouping == "single":
         return None

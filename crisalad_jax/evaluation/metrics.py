@@ -24,8 +24,8 @@ def right_retrievals(
         positives: correct database indices of each query, possibly none.
 
     Raises:
-        InputError: no queries; positives for a different number of queries; a negative index, which
-            some ground truths use for "no match" (leave it out).
+        InputError: there are no queries; `positives` has another number of queries; or an index in
+            it is negative, which some ground truths use for "no match" (leave such an index out).
     """
     fits = 0 < len(indices) == len(positives)
     if not fits or any(np.min(wanted, initial=0) < 0 for wanted in positives):
@@ -56,7 +56,7 @@ def recalls(
         Fractions of the queries, 0 to 1, by K.
 
     Raises:
-        InputError: a K below 1; no queries; or `positives` that do not fit (`right_retrievals`).
+        InputError: a K is below 1, or `right_retrievals` raises it.
     """
     for k in ks:
         check_count("ks", k)
@@ -88,7 +88,7 @@ def bootstrap_interval(hits: Int[np.ndarray, " q"], trials: int = 1) -> Interval
         trials: number of trials per query, such as seeds; their spread is not in the interval.
 
     Raises:
-        InputError: no queries, or a hit below 0 or above `trials`.
+        InputError: there are no queries, or a number of hits is below 0 or above `trials`.
     """
     require(
         np.size(hits) > 0 and bool(np.isin(hits, np.arange(trials + 1)).all()),
@@ -113,15 +113,15 @@ class PrecisionRecall(NamedTuple):
     """
 
     thresholds: Float[np.ndarray, " threshold"]
-    """Distinct similarities of first retrievals, descending; at or above one, all are accepted."""
+    """Distinct similarities of first retrievals, descending; all at or above one are accepted."""
     precision: Float64[np.ndarray, " threshold"]
     """Share of the accepted queries whose first retrieval is correct."""
     recall: Float64[np.ndarray, " threshold"]
-    """Share of the queries with a positive that are accepted and correct."""
+    """Of the queries with a positive, the share whose first retrieval is accepted and correct."""
     average_precision: float
     """Area under the step curve: each gain in recall times the precision there."""
     recall_at_full_precision: float
-    """The largest recall without a wrong retrieval; 0 if the most similar one is wrong."""
+    """Largest recall at a precision of 1; 0 if no threshold has this precision."""
 
 
 def accepted(
@@ -134,8 +134,8 @@ def accepted(
         right: which first retrievals are correct.
 
     Returns:
-        The similarities in descending order. Then, for each distinct one as the threshold, the
-        index in that order of the last accepted query, and how many accepted ones are correct.
+        The similarities in descending order. Then, for each distinct similarity as the threshold,
+        the index there of the last accepted query, and how many accepted queries are correct.
 
     Raises:
         InputError: a similarity is NaN.
@@ -156,8 +156,8 @@ def precision_recall(
 
     This is the single-best-match evaluation of Schubert et al. 2024, "Visual Place Recognition: A
     Tutorial", at every possible threshold. Queries of equal similarity are accepted together.
-    Accepting a query without positives is always wrong. The recall here leaves such queries out, so
-    with any of them its last value is higher than Recall@1, which is over all queries.
+    Accepting a query without positives is always wrong. The recall here leaves such queries out; if
+    there are any, its last value is therefore above Recall@1, which is over all queries.
 
     Args:
         indices: database indices of each query's neighbours, best first; only the first counts.
@@ -168,7 +168,7 @@ def precision_recall(
         The curve, or None if no query has a positive, since recall is then undefined.
 
     Raises:
-        InputError: a similarity is NaN; no queries; or `positives` that do not fit.
+        InputError: a similarity is NaN, or `right_retrievals` raises it.
     """
     right = right_retrievals(indices[:, :1], positives)[:, 0]
     answerable = sum(np.size(wanted) > 0 for wanted in positives)

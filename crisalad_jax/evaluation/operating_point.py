@@ -1,4 +1,4 @@
-"""The similarity threshold at which accepted first retrievals reach a given precision."""
+"""The similarity threshold at which the accepted top-1 retrievals reach a given precision."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ CONFIDENCE = 0.95
 
 
 class OperatingPoint(NamedTuple):
-    """Outcome of accepting first retrievals at or above a threshold on their similarity.
+    """Outcome of accepting first (top-1) retrievals at or above a threshold on their similarity.
 
     If no threshold reaches the requested precision, the one with the highest precision is used, and
     `reached` is False.
@@ -39,7 +39,7 @@ class OperatingPoint(NamedTuple):
 
     @property
     def precision(self) -> float:
-        """Share of the accepted first retrievals that are correct."""
+        """Share of the accepted top-1 retrievals that are correct."""
         return self.right / self.answered
 
     @property
@@ -58,7 +58,7 @@ class OperatingPoint(NamedTuple):
 
     @property
     def recall(self) -> float:
-        """Share of all queries that are accepted and correct."""
+        """Share of all queries whose first retrieval is accepted and correct."""
         return self.right / self.queries
 
     @property
@@ -91,14 +91,14 @@ def operating_point(
         indices: database indices of each query's neighbours, best first; only the first counts.
         similarities: similarities of `indices`.
         positives: correct database indices of each query, possibly none.
-        precision: share of accepted first retrievals that must be correct, above 0 and at most 1.
+        precision: share of accepted retrievals that must be correct, above 0 and at most 1.
 
     Returns:
         The outcome at the lowest threshold that reaches the precision, or else at the most precise
-        one; it is rounded down to the fewest decimals, three or more, that accept the same queries.
+        one. Either is rounded down to the fewest decimals, 3 or more, that accept the same queries.
 
     Raises:
-        InputError: a precision out of range; a NaN; no queries; or `positives` that do not fit.
+        InputError: `precision` is out of range, or `accepted` or `right_retrievals` raises it.
 
     Example:
         >>> import numpy as np

@@ -62,7 +62,7 @@ def check_groupings(texts: Sequence[str]) -> list[str]:
     """Check groupings, also published ones, and return the kinds in them, such as "shuffled".
 
     Raises:
-        InputError: a text that `Grouping.parse` does not read, or an unknown published grouping.
+        InputError: `Grouping.parse` cannot read a text, or a published grouping is unknown.
     """
     for text in texts:
         if text.startswith(PREFIX):
@@ -82,7 +82,7 @@ def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
         benchmark: the evaluated benchmark.
 
     Raises:
-        InputError: a published grouping that does not fit the benchmark (`Protocol.batch_size`).
+        InputError: a published grouping does not fit the benchmark (`Protocol.batch_size`).
 
     Example:
         >>> import pathlib

@@ -36,7 +36,7 @@ class Scores(NamedTuple):
     average_precision: float | None
     """Area under the curve of `PrecisionRecall`; None if no query has a positive."""
     recall_at_full_precision: float | None
-    """Largest recall without a wrong retrieval; None if no query has a positive."""
+    """Largest recall at a precision of 1; None if no query has a positive."""
 
 
 @brief
@@ -47,7 +47,7 @@ class Skipped(NamedTuple):
     database: tuple[int, ...] = ()
 
     def rest_of(self, benchmark: Benchmark) -> Benchmark:
-        """Return the benchmark without the skipped images, whose indices the results use."""
+        """Return the benchmark without the skipped images; indices in the results refer to it."""
         queries = np.ones(len(benchmark.queries), bool)
         database = np.ones(len(benchmark.database), bool)
         queries[list(self.queries)] = database[list(self.database)] = False
@@ -94,7 +94,7 @@ class GroupingResult(NamedTuple):
     skipped: Skipped = Skipped()
     """The unreadable images that were left out, the same under every grouping."""
     operating_point: OperatingPoint | None = None
-    """The similarity with the requested precision, for the first seed; None unless requested."""
+    """Outcome at the requested precision, for the first seed; None unless requested."""
 
     @property
     def label(self) -> str:
@@ -112,7 +112,7 @@ def summarise(
     precision: float | None = None,
     **known: Any,
 ) -> GroupingResult:
-    """Summarise the rankings of one grouping as its result.
+    """Make the result of one grouping from its rankings.
 
     Args:
         grouping: name of the grouping.
@@ -121,10 +121,10 @@ def summarise(
         ks: the values of K.
         is_random: whether the rankings differ between seeds.
         precision: precision of the operating point; None for no operating point.
-        **known: other fields of `GroupingResult`, such as its shares.
+        **known: other fields of `GroupingResult`, such as `query_share`.
 
     Raises:
-        InputError: no queries, a K below 1, a NaN similarity, or a precision out of range.
+        InputError: there are no queries, a similarity is NaN, or a K or `precision` is invalid.
     """
     first = next(iter(rankings.values()))
     rights = [right_retrievals(each.indices, positives) for each in rankings.values()]
@@ -155,7 +155,7 @@ def summarise(
 
 
 def over_single(results: Sequence[GroupingResult]) -> list[GroupingResult]:
-    """Return results with `over_single` set: each against `single` with the same second stage."""
+    """Return results with `over_single` set, relative to `single` with the same second stage."""
     alone = {each.rerank: each.firsts for each in results if each.grouping == "single"}
 
     def difference(result: GroupingResult) -> Difference | None:

@@ -18,7 +18,7 @@ def similarity_map(
     (`cells_of`); a cell holds their largest similarity. Memory does not grow with their number.
 
     Raises:
-        InputError: an array is empty or not of unit descriptors, or their lengths differ.
+        InputError: an array is empty, a row is not a unit vector, or the lengths of rows differ.
     """
     database, queries = as_sides(database, queries)
     rows, columns = cells_of(len(queries), most), cells_of(len(database), most)

@@ -82,7 +82,7 @@ def adapt(
     """Adapt a map's model to the map's environment, or resume the run in `out`.
 
     A place has the images within `place_radius` of its centre; in a map without positions, it has
-    `place_frames` consecutive images, or by default only one under two augmentations. A fifth of
+    `place_frames` consecutive images, by default a single one under two augmentations. A fifth of
     the map's images, at most 100, is held out. Augmented copies of these query the rest of the map:
     two copies of each decide how long to train, and two others whether recall was gained.
 
@@ -95,13 +95,13 @@ def adapt(
             added to the map.
         place_radius: radius of a place in metres, for a map with positions; None for 10.
         place_frames: number of consecutive images of a place, for a map without positions; None
-            for a place of each image.
+            makes each image a place.
         watch: evaluation sets of other places, whose recall is compared before and after.
         most_lost: largest accepted drop in Recall@1 of a watched set, as a fraction; the map is
             not replaced if any drops more.
         replace: whether to rebuild the map with the adapted model; see `remake_map`.
         fps: frames per second taken from videos and robot logs among `images`; None for 1.
-        topic: the topic of images in a robot log among `images`; None for its only one.
+        topic: the topic of images in a robot log among `images`; None if it has only one.
         reading: how images are read.
         callbacks: see `fit`.
         say: called with each line of progress, for instance `print`.
@@ -110,10 +110,10 @@ def adapt(
         The gains, which are also written to `adapted.json` in `out`.
 
     Raises:
-        InputError: a model other than the map's; missing images, or too few; `place_frames` for a
-            map with positions, or `place_radius` for one without; `out` within the map; `replace`
-            for a map that cannot be rebuilt; a map that was already rebuilt with the weights in
-            `out`; unreadable `images` or `watch`; or what `fit` raises.
+        InputError: the model is not the map's; images are missing or too few; `place_frames` is set
+            for a map with positions, or `place_radius` for one without; `out` is within the map;
+            `replace` is set, but the map cannot be rebuilt; the map was already rebuilt with the
+            weights in `out`; `images` or `watch` cannot be read; or `fit` raises it.
         Interrupted: a signal stopped the run; the same call resumes it.
 
     Example:

@@ -51,7 +51,7 @@ class DemoConfig:
 
 
 class DemoSummary(NamedTuple):
-    """Results and files of the demo, and its seconds in all and in training."""
+    """Results and files of the demo, and the seconds that it took, in total and for training."""
 
     rows: list[RecallRow]
     pictures: list[pathlib.Path]
@@ -126,7 +126,7 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
 
 
 def demo_recipe(config: DemoConfig) -> TrainConfig:
-    """Return the `tiny` recipe for four images per place, mildly augmented: their light varies."""
+    """Return the `tiny` recipe: four images per place, mildly augmented as their light varies."""
     return dataclasses.replace(
         recipe("tiny"),
         augmentation=LightAugmentConfig(),

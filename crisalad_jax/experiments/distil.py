@@ -52,7 +52,7 @@ def distil(
     """Train a student on a teacher's descriptors of the same images, or resume the run in `out`.
 
     The teacher describes the images once, at its own image size and without augmentation. Its
-    descriptors are cached (folder `teachers` of this package's cache), so other students of the
+    descriptors are cached (folder `teachers` of this package's cache), so later runs on the
     same images reuse them. The student trains on augmented images.
 
     Args:
@@ -60,15 +60,15 @@ def distil(
             teacher's descriptors is filled in.
         teacher: the model to learn from.
         images: one source of images or several, as `extract` takes them; None with `data`.
-        data: places with labels, in place of `images`, in a layout that `read_places` reads; only
+        data: labelled places instead of `images`, in a layout that `read_places` reads; only
             the term `labels` of the loss uses the labels.
         out: folder of the run; see `fit`.
-        weights: weights that the student starts from, or the name of a published model.
+        weights: weights to start from, or a published model's name; None for random weights.
         validation: evaluation set that selects the best weights and, with `config.patience`, stops
             early; in any layout that `open_benchmark` reads.
-        validation_images: folder of the images, if a .mat file or .npy in `validation` lists them.
+        validation_images: folder of the images, if `validation` is a .mat file or .npy lists.
         fps: frames per second taken from videos and robot logs; None for 1.
-        topic: the topic of images in a robot log; None for its only one.
+        topic: the topic of images in a robot log; None if it has only one.
         reading: how images are read.
         cache_gb: maximum gigabytes of remote images cached on this host's disk.
         callbacks: see `fit`.
@@ -78,9 +78,9 @@ def distil(
         The student's final parameters, and how the run ended.
 
     Raises:
-        InputError: both or neither of `images` and `data`; a loss other than `distil`; its `labels`
-            without `data`, or with one image per place; a student with a cross-image encoder; too
-            few images, or unreadable ones; or what `open_benchmark` and `fit` raise.
+        InputError: both or neither of `images` and `data` are given; the loss is not `distil`, or
+            uses `labels` without `data` or with one image per place; the student has a cross-image
+            encoder; images are too few or unreadable; or `open_benchmark` or `fit` raises it.
         Interrupted: a signal stopped the run; the same call resumes it.
 
     Example:

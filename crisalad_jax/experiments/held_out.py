@@ -25,8 +25,8 @@ from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 SHARE, MOST = 0.2, 100
 """Share of a map's images that is held out, and the maximum number of held-out images."""
 CHOOSING, JUDGING = range(2), range(2, 4)
-"""Numbers of the augmented copies of a held-out image that stop the training, and of those that
-measure the gain; they differ because the best of several validations is biased upwards."""
+"""Numbers of the augmented copies of a held-out image that decide when training stops, and of the
+others that measure the gain: the best of several validations would be biased upwards."""
 
 
 class Split(NamedTuple):
@@ -37,7 +37,7 @@ class Split(NamedTuple):
     training: Places
     """Places made of the images that are not held out."""
     answers: dict[int, list[int]]
-    """Correct answers to each held-out image among the map's others; itself if there are none."""
+    """Correct answers to each held-out image in the rest of the map; the image itself if none."""
     database: list[int]
     """Images of the map that the held-out images query."""
     rule: str
@@ -57,7 +57,7 @@ def split_images(
         sources: the images of the map, then any others of its environment.
         seed: random seed for drawing the held-out images.
         place_radius: metres within which images show the same place.
-        place_frames: number of consecutive images of a place; without either, each image is one.
+        place_frames: number of consecutive images of a place; with neither, each image is a place.
 
     Raises:
         InputError: the map has one image, or no place is left.

@@ -67,7 +67,7 @@ def publish(
 
     Raises:
         InputError: the run has no weights; a file is missing or damaged; the folder is not empty,
-            or the repository has such files; an invalid licence name; or the upload fails.
+            or the repository has such files; the licence name is invalid; or the upload fails.
         ModuleNotFoundError: huggingface_hub is not installed, and `to` is on the hub.
 
     Example:

@@ -136,7 +136,7 @@ class RecallRow(NamedTuple):
 
 
 def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:
-    """Make a table of recalls in percent, with one decimal; K that a row lacks are "-"."""
+    """Make a table of recalls in percent, with one decimal; "-" for each K that a row lacks."""
     ks = sorted({k for row in rows for k in row.recalls})
     body = [
         [row.benchmark, row.model, row.grouping]

@@ -67,7 +67,7 @@ def train(
         out: folder of the run; see `fit`.
         validation: evaluation set that selects the best weights and, with `config.patience`, stops
             early; in any layout that `open_benchmark` reads.
-        validation_images: folder of the images, if a .mat file or .npy in `validation` lists them.
+        validation_images: folder of the images, if `validation` is a .mat file or .npy lists.
         weights: a complete model to start from, or a published model's name. It must fit
             `config.model`; `recipe(model=load(weights).config)` makes a `config` that does.
         backbone: a checkpoint to start the backbone from, or a published model's name.
@@ -84,7 +84,7 @@ def train(
 
     Raises:
         InputError: the data or weights cannot be read or do not fit; `out` holds something other
-            than a run with this configuration; or what `open_benchmark` and `fit` raise.
+            than a run with this configuration; or `open_benchmark` or `fit` raises it.
         Interrupted: a signal stopped the run; the same call resumes it.
 
     Example:

@@ -80,10 +80,10 @@ def attention(
         length: number of leading tokens that are not padding; only these are attended to. None
             means all. See `attention_fused.padded_length`.
         rotation: angles by which queries and keys are rotated; None rotates none.
-        update: returns what an adapter adds to the output of a projection; by default nothing.
+        update: function that returns what an adapter adds to a projection's output, if anything.
 
     Returns:
-        The attention's output. Scores and softmax are in float32 at least, for every type of `x`.
+        The attention's output. Scores and softmax are in at least float32, for every type of `x`.
     """
     tokens = x.shape[-2]
     length = tokens if length is None else length
@@ -109,8 +109,8 @@ def split_heads(x: Float[Array, "*batch dim"], heads: int) -> Float[Array, "*bat
 def rotate(x: Heads, rotation: Rotation, *, length: int | None = None) -> Heads:
     """Rotate queries or keys by the angles of their tokens (RoPE: Su et al. 2021), in float32.
 
-    Dimensions i and i + dim / 2 of a head are a pair. Of the `length` leading tokens that are not
-    padding (None: all), the last have angles. All other tokens are returned bit for bit.
+    Dimensions i and i + dim / 2 of a head are a pair. The first `length` tokens are not padding
+    (None: all); the last of these have angles. All other tokens are returned unchanged.
     """
     wide = at_least_float32(x)
     length = x.shape[-3] if length is None else length
@@ -150,7 +150,7 @@ def first_token_attention(
     rotation: Rotation | None = None,
     update: LinearUpdate = no_update,
 ) -> Float[Array, "*batch head token"]:
-    """Compute the first token's weights in `attention`, over all tokens, in float32 at least.
+    """Compute the first token's weights in `attention`, over all tokens, in at least float32.
 
     The weights of a head sum to 1. `rotation` rotates only keys: the first token has no angle.
     """
@@ -173,7 +173,7 @@ def attention_weights(
     rotation: Rotation | None = None,
     update: LinearUpdate = no_update,
 ) -> Float[Array, "*batch head token token"]:
-    """Compute the weights of `attention`, of every token for every token, in float32 at least.
+    """Compute the weights in `attention` of all pairs of tokens, in at least float32.
 
     Each row sums to 1. `mask[i, j]` allows token i to attend to token j; None allows all.
     """

@@ -44,7 +44,7 @@ def attend(
         length: number of leading tokens that are not padding; only these are attended to.
 
     Returns:
-        The averages; None if no kernel supports this type, width and number of tokens here.
+        The averages; None if this platform has no kernel for this type, width and token count.
     """
     *batch, tokens, three_heads, width = qkv.shape
     heads = three_heads // 3

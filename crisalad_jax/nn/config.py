@@ -48,7 +48,7 @@ class ModelConfig:
     projection: ProjectionConfig = ProjectionConfig()
     """Linear layer over the descriptor; by default none."""
     compute_dtype: Literal["float32", "bfloat16", "float64"] = non_semantic_field("float32")
-    """Type of the matrix products; normalisations, softmax and transport are float32 at least.
+    """Type of the matrix products; normalisations, softmax and transport are at least float32.
     float64 is for numerical studies, under JAX's 64-bit mode."""
     precision: Literal["highest", "high", "default"] = non_semantic_field("highest")
     """Precision of float32 products on accelerators, as JAX names it: "highest" is float32,

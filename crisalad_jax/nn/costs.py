@@ -50,8 +50,8 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
 
     Args:
         config: the model's configuration; images are of its `input_size`.
-        images: number of images that attend to each other in the cross-image encoder. Only the
-            cost of its attention depends on it.
+        images: number of images that attend to each other in the cross-image encoder. It affects
+            only the cost of the encoder's attention.
 
     Returns:
         One `PartCost` for each part, from the input to the descriptor.
@@ -99,8 +99,8 @@ def count_macs(function: Any, *arguments: Any) -> "collections.Counter[str]":
         arguments: arrays, or their shapes (`jax.ShapeDtypeStruct`).
 
     Returns:
-        The counts by name of the model's part, and of everything else under an empty name. Only
-        the cheapest branch of a conditional counts.
+        The counts by model part; those of everything else have an empty name. Of a conditional,
+        only the cheapest branch counts.
 
     Example:
         >>> import jax.numpy as jnp

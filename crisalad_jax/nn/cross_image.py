@@ -61,7 +61,7 @@ class CrossImage(Part, abc.ABC):
     """Whether the global token takes part, cut into tokens as wide as the local ones."""
     width = None  # untyped too
     """Width of the tokens that the unit descriptor is cut into; the encoder's output is then the
-    descriptor, not normalised. None takes the aggregator's tokens."""
+    descriptor, not normalised. If None, the encoder's input is the aggregator's tokens."""
 
     def check(self, dim: int) -> None:
         """Raise InputError if tokens of this width are not supported; by default never."""

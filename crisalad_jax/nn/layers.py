@@ -1,4 +1,4 @@
-"""Small layers: linear, layer norm, convolutions on a patch grid, GELU, dropout, L2."""
+"""Small layers: linear, norms, convolutions on a patch grid, GELU, dropout, L2 normalisation."""
 
 import dataclasses
 import functools
@@ -15,7 +15,7 @@ from crisalad_jax.nn.products import convolve, matmul
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 Keys = Key[Array, "*keys"] | None
-"""One random key for all, or one for each entry of a batch; None means inference."""
+"""One random key for a whole batch, or one for each entry; None means inference."""
 Grid = tuple[int, int]
 """Rows and columns of patches."""
 Valid = Bool[Array, " image"] | None
@@ -116,13 +116,13 @@ def init_depthwise_conv(
 
 
 def init_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
-    """Draw like torch's `nn.Conv2d`: uniform within +- 1 / sqrt(kernel_size^2 d_in)."""
+    """Draw a layer like torch's `nn.Conv2d`: uniform within +- 1 / sqrt(kernel_size^2 d_in)."""
     shape = kernel_size, kernel_size, d_in, d_out
     return Conv(*_within(key, shape, fan=kernel_size**2 * d_in))
 
 
 def init_transposed_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
-    """Draw like torch's `nn.ConvTranspose2d`: within +- 1 / sqrt(kernel_size^2 d_out)."""
+    """Draw like torch's `nn.ConvTranspose2d`: uniform within +- 1 / sqrt(kernel_size^2 d_out)."""
     shape = kernel_size, kernel_size, d_in, d_out
     return Conv(*_within(key, shape, fan=kernel_size**2 * d_out))
 
@@ -147,7 +147,7 @@ def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def residual_sum(
     x: Float[Array, "*batch dim"], update: Float[Array, "*batch dim"]
 ) -> Float[Array, "*batch dim"]:
-    """Add an update in float32 at least, and round once to the type of `x`."""
+    """Add an update in at least float32, and round once to the type of `x`."""
     return (at_least_float32(x) + at_least_float32(update)).astype(x.dtype)
 
 
@@ -163,7 +163,7 @@ def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*bat
 
 
 LinearUpdate = Callable[[str, Array], Array | None]
-"""Function of a linear layer's name and input: what an adapter adds to its output, or None."""
+"""Function from a linear layer's name and input to what an adapter adds to its output, or None."""
 
 
 def no_update(name: str, x: Array) -> None:
@@ -186,9 +186,9 @@ def columns(params: Linear, start: int, stop: int) -> Linear:
 def layer_norm(
     params: LayerNorm, x: Float[Array, "*batch dim"], *, epsilon: float = 1e-5
 ) -> Float[Array, "*batch dim"]:
-    """Normalise the last axis to mean 0 and variance 1, in float32, and return the type of `x`.
+    """Normalise the last axis to mean 0 and variance 1, and return the result in the dtype of `x`.
 
-    The default of `epsilon` is torch's.
+    Mean and variance are computed in at least float32. The default of `epsilon` is torch's.
     """
     y = _standardise(at_least_float32(x), epsilon) * params.weight + params.bias
     return y.astype(x.dtype)

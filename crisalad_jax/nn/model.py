@@ -61,7 +61,7 @@ class Crisalad:
     cross_image: Any
     """Parameters of `ModelConfig.cross_image`; None if it has none."""
     projection: Linear | None = None
-    """Parameters of `ModelConfig.projection`; None without one."""
+    """Parameters of `ModelConfig.projection`; None if there is no projection."""
 
 
 @brief
@@ -277,12 +277,12 @@ def describe(
         micro_batch: see `extract_tokens`; images still attend to the whole batch.
 
     Returns:
-        Descriptors in float32 at least, of length 1 if `config.unit_length`.
+        Descriptors in at least float32, of length 1 if `config.unit_length`.
 
     Raises:
-        InputError: the parameters do not match the configuration; or, while tracing, there are no
-            images, images of a wrong type, rank, channels or sides, or too few patches for the
-            clusters; the mask has a wrong shape; or `micro_batch` does not divide the batch.
+        InputError: the parameters do not match the configuration; float images are not normalised;
+            `images` is empty, or of a wrong type or shape; there are too few patches for the
+            aggregator; `mask` has a wrong shape; or `micro_batch` does not divide the batch.
 
     Example:
         >>> import jax, numpy as np
@@ -324,7 +324,7 @@ def extract_tokens(
         The tokens of each image.
 
     Raises:
-        InputError: what `describe` raises.
+        InputError: an argument is invalid (see `describe`).
 
     Example:
         >>> import jax, numpy as np
@@ -366,7 +366,7 @@ def tokens_and_statistics(
         statistics after this batch, and None for all other leaves; it is None if `valid` is.
 
     Raises:
-        InputError: what `describe` raises.
+        InputError: an argument is invalid (see `describe`).
     """
     count = images.shape[0]  # may be symbolic, unlike `len`
     keys = None if key is None else jax.random.split(key, count)
@@ -452,7 +452,7 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
         The requested features.
 
     Raises:
-        InputError: what `describe` raises.
+        InputError: an argument is invalid (see `describe`).
 
     Example:
         >>> import jax, numpy as np
@@ -518,12 +518,12 @@ def _widened(params: Crisalad, config: ModelConfig) -> Crisalad:
 def unit_features(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch dim"]:
-    """Return the aggregator's patch features, scaled to unit length, in float32 at least.
+    """Return the aggregator's patch features, scaled to unit length, in at least float32.
 
     Arguments are those of `describe`. Tokens that the aggregator would insert are left out.
 
     Raises:
-        InputError: what `describe` raises.
+        InputError: an argument is invalid (see `describe`).
     """
     features, _ = _extract_features(params, images, config, with_insertion=False)
     return l2_normalise(at_least_float32(features.patches))
@@ -645,11 +645,11 @@ def attention_maps(
         block: index of the block, from 0; negative indices count from the last.
 
     Returns:
-        The softmax of the scores, in float32 at least.
+        The softmax of the scores, in at least float32.
 
     Raises:
         InputError: the backbone has no such block or no attention, or has adapters with prompts or
-            a side path; the aggregator inserts tokens; or what `describe` raises.
+            a side path; the aggregator inserts tokens; or an argument is invalid (see `describe`).
 
     Example:
         >>> import jax, numpy as np
@@ -699,10 +699,10 @@ def cross_image_attention(
         mask: see `describe`.
 
     Returns:
-        The softmax of the scores, in float32 at least.
+        The softmax of the scores, in at least float32.
 
     Raises:
-        InputError: the model has no cross-image encoder with attention, or what `describe` raises.
+        InputError: the model has no such attention, or an argument is invalid (see `describe`).
 
     Example:
         >>> import jax, numpy as np
@@ -778,7 +778,7 @@ def transport_masses(
         The plan of each image.
 
     Raises:
-        InputError: the model's aggregator has no transport, or what `describe` raises.
+        InputError: the aggregator has no transport, or an argument is invalid (see `describe`).
 
     Example:
         >>> import jax, numpy as np

@@ -16,14 +16,14 @@ from crisalad_jax.utils.target import target, widens_slices
 def product_precision(dtype: Any) -> jax.lax.Precision | None:
     """Return the precision of a matrix product in `dtype`; None is that of JAX's configuration.
 
-    One pass of an accelerator multiplies numbers of 8 bits exactly, so bfloat16 needs only one.
+    An accelerator multiplies 8-bit significands exactly in one pass, so bfloat16 needs only one.
     """
     single = dtype == jnp.bfloat16 and target().platform != "cpu"
     return jax.lax.Precision.DEFAULT if single else None
 
 
 def rule_precision(dtype: Any) -> str | None:
-    """Return the current precision, for custom rules whose backward pass is traced without it."""
+    """Return the current precision, for custom gradients, whose backward pass is traced later."""
     if product_precision(dtype) is not None:
         return "default"
     return None if target().platform == "cpu" else jax.config.jax_default_matmul_precision  # pyright: ignore
@@ -41,7 +41,7 @@ def row_major(x: Array) -> Array:
 def keep(x: Array, name: str) -> Array:
     """Name a result, so that a policy of `jax.checkpoint` saves it for the gradient.
 
-    Where XLA would widen everything saved in bfloat16 (`widens_slices`), its bits are saved.
+    Where XLA would widen saved bfloat16 arrays (`widens_slices`), their bits are saved instead.
     """
     if x.dtype == jnp.bfloat16 and widens_slices():
         return _keep_bits(x, name)
@@ -81,7 +81,7 @@ def map_first_axis(function: Callable[[Any], Array], stacks: Any) -> Array:
 
 
 def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:
-    """Multiply rows by a weight cast to their type; products of bfloat16 may be in float32."""
+    """Multiply rows by a weight cast to their dtype; for bfloat16, the result may be float32."""
     dtype = rows.dtype
     if dtype == jnp.bfloat16 and target().platform == "cpu":
         return _narrow_matmul(rows, weight)

@@ -32,7 +32,7 @@ class Tokens(NamedTuple):
     global_token: Float[Array, "*batch global_dim"]
     local: Float[Array, "*batch token dim"]
     transport: TransportStatistics | None = None
-    """Statistics of the transport; None without one, or after the cross-image encoder."""
+    """Statistics of the transport; None without a transport, or after the cross-image encoder."""
     dense: Float[Array, "*batch feature local"] | None = None
     """Local features of an image for a loss that compares them (SelaVPR); only in training."""
 
@@ -48,7 +48,7 @@ class Tokens(NamedTuple):
 
 
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "*batch token dim"]:
-    """Return the global token, if it takes part, cut to the local width, then the local tokens."""
+    """Join the global token (if `global_token`), cut to the local width, and the local tokens."""
     if not global_token:
         return tokens.local
     *batch, _, dim = tokens.local.shape
@@ -59,7 +59,7 @@ def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "*batch t
 def from_sequence(
     sequence: Float[Array, "*batch token dim"], before: Tokens, *, global_token: bool
 ) -> Tokens:
-    """Undo `as_sequence`; a global token that does not take part is taken from `before`."""
+    """Undo `as_sequence`; a global token that is not in the sequence is taken from `before`."""
     if not global_token:
         return Tokens(before.global_token, sequence)
     pieces = sequence.shape[-2] - before.local.shape[-2]

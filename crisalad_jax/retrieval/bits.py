@@ -36,7 +36,7 @@ def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8
     """Pack the signs of descriptors: a bit is 1 where a value is at least 0.
 
     The first dimension is the highest bit of the first byte, as in `numpy.packbits`. A value of 0
-    gives a bit of 1, as in SelaVPR++; the only difference in TeTRA is that it gives a bit of 0.
+    gives a bit of 1, as in SelaVPR++; TeTRA differs only in that a value of 0 gives a bit of 0.
 
     Args:
         descriptors: descriptors of the n images, of any norm; d is a multiple of 8.
@@ -45,7 +45,7 @@ def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8
         The packed bits, which `search` accepts as they are.
 
     Raises:
-        InputError: not a matrix of finite numbers, or d is not a multiple of 8.
+        InputError: the array is not a matrix of finite numbers, or d is not a multiple of 8.
 
     Example:
         >>> import numpy as np
@@ -59,7 +59,7 @@ def to_bits(array: np.ndarray, name: str, length: int) -> Bits:
     """Pack descriptors of `length` dimensions, or check them if they are packed already.
 
     Raises:
-        InputError: what `pack_bits` and `as_bits` raise; the message calls the array `name`.
+        InputError: the array holds neither, or has another length; the message calls it `name`.
     """
     convert = as_bits if np.asanyarray(array).dtype == BITS else _packed
     return convert(array, name, length)
@@ -78,7 +78,7 @@ def check_packable(length: int, name: str) -> None:
 
 
 def sign_vectors(bits: Bits) -> Float32[np.ndarray, "n d"]:
-    """Unpack bits into unit vectors of +v and -v, whose cosines are the similarities of bits."""
+    """Unpack bits into unit vectors of +v and -v, whose cosines equal the bits' similarities."""
     size = np.float32(1 / np.sqrt(8 * bits.shape[1]))
     return np.where(np.unpackbits(bits, axis=1), size, -size)
 
@@ -104,7 +104,7 @@ def search_bits(database: Bits, queries: Bits, k: int) -> Neighbours:
     """Find the k rows with the most bits in common with each query, as `retrieval.search` does.
 
     Raises:
-        InputError: arrays that are not packed bits of the same length.
+        InputError: the arrays are not packed bits of the same length.
     """
     database = as_bits(database, "database")
     queries = as_bits(queries, "queries", 8 * database.shape[1])

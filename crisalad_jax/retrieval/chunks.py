@@ -27,7 +27,7 @@ _SCATTERED = 4
 
 
 def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descriptors:
-    """Check that an array is a matrix of descriptors, of `length` if given, and return a view.
+    """Check that an array is a matrix of descriptors (of `length`, if given), and return a view.
 
     Values of two untyped bytes ("V2"), as a .npy file stores bfloat16, are viewed as bfloat16.
 
@@ -53,7 +53,7 @@ def as_unit_rows(array: np.ndarray, name: str, length: int | None = None) -> Que
     """Check that an array is a matrix of unit descriptors, and return it in float32.
 
     Raises:
-        InputError: what `as_rows` and `check_rows` raise.
+        InputError: the array is not such a matrix; see `as_rows` and `check_rows`.
     """
     wide = np.ascontiguousarray(_widened(as_rows(array, name, length)))
     check_rows(wide, name, range(len(wide)), unit=True)
@@ -64,7 +64,7 @@ def as_sides(database: np.ndarray, queries: np.ndarray) -> tuple[Descriptors, De
     """Check that database and queries hold descriptors of the same length, and return them.
 
     Raises:
-        InputError: what `as_rows` raises.
+        InputError: one is not a matrix of descriptors (see `as_rows`), or the lengths differ.
     """
     database = as_rows(database, "database")
     return database, as_rows(queries, "queries", database.shape[1])

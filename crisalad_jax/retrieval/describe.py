@@ -107,8 +107,8 @@ def describe_files(
         A descriptor of each readable file, in order; unit vectors if `model.config.unit_length`.
 
     Raises:
-        InputError: no files, an unreadable one that is not skipped, or parameters that do not match
-            the configuration.
+        InputError: no files are given, one is unreadable and not skipped, or the parameters do not
+            match the configuration.
 
     Example:
         >>> import jax
@@ -142,8 +142,8 @@ def describe_images(
         A descriptor of each image, in order; unit vectors if `model.config.unit_length`.
 
     Raises:
-        InputError: no images, or one that `prepare_image` does not accept or that the model cannot
-            describe.
+        InputError: no images are given, `prepare_image` does not accept one, or the parameters do
+            not match the configuration.
 
     Example:
         >>> import jax, numpy as np
@@ -196,16 +196,16 @@ def described(
     window: int = 1,
     components: Pca | None = None,
 ) -> Iterator[Described]:
-    """Describe images in order, batch by batch, each with the `window - 1` before it.
+    """Describe images in order, batch by batch, each with the `window - 1` images before it.
 
     Images that cannot be read are left out. The grouping is "window", or "single" for a window of
     1. Memory holds two batches, and the images that are read ahead. `components` shorten the
-    descriptors. With a window of 1 they shorten whole batches, so that the bits of a descriptor do
-    not depend on which other images could be read.
+    descriptors. With a window of 1 they shorten whole batches, so that a descriptor does not
+    depend, not even by rounding, on which other images could be read.
 
     Raises:
-        InputError: an image cannot be read and `reading` says "stop"; or what `FrameDescriber`
-            raises.
+        InputError: an image cannot be read and `reading.on_bad_image` is "stop"; or the window does
+            not fit the model (see `FrameDescriber`).
     """
     shorten = (lambda rows: rows) if components is None else components.apply
     frames = FrameDescriber(describer, window)
@@ -221,10 +221,10 @@ def described(
 def token_rows(
     describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
 ) -> Iterator[Described]:
-    """Yield the tokens of images in order, batch by batch, in place of descriptors.
+    """Yield the tokens of images in order, batch by batch, in the field `descriptors`.
 
     Raises:
-        InputError: an image cannot be read and `reading` says "stop".
+        InputError: an image cannot be read and `reading.on_bad_image` is "stop".
     """
     return _each_batch(describer, paths, reading, lambda rows, valid: rows[valid])
 
@@ -316,7 +316,7 @@ class TokenSet:
 def group(
     describer: Describer, rows: Rows, batches: Batches, **options: Any
 ) -> Float[np.ndarray, "image descriptor"]:
-    """Return descriptors of images in batches, in image order; options are those of `grouped`."""
+    """Return descriptors of images grouped in batches, in image order; options as in `grouped`."""
     descriptors = np.empty((len(rows), describer.config.descriptor_dim), np.float32)
     for images, found in grouped(describer, rows, batches, **options):
         descriptors[images] = found
@@ -361,7 +361,7 @@ def grouped(
 
 
 class FrameDescriber:
-    """A describer of images as they arrive, each with the `window - 1` before it."""
+    """A describer of images as they arrive, each with the `window - 1` images before it."""
 
     def __init__(self, describer: Describer, window: int = 1) -> None:
         """Start without an image.
@@ -382,7 +382,7 @@ class FrameDescriber:
         """Describe the next image: 8-bit RGB or grey, of any size.
 
         Raises:
-            InputError: what `prepare_image` raises.
+            InputError: `prepare_image` does not accept the image.
         """
         one = self._describer.preparation.prepare(image)[None]
         number, valid = np.zeros(1, int), np.ones(1, bool)

@@ -62,8 +62,8 @@ def describer_of(
         groupings: the groupings that it must support, in the syntax of `Grouping.parse`.
 
     Raises:
-        InputError: not a model; parameters that do not match the configuration; or a program of an
-            engine that is for other groupings.
+        InputError: `model` is none of these; its parameters do not match its configuration; or it
+            is a program that was exported for other groupings.
     """
     if isinstance(model, Runtime):
         model.check_groupings(groupings)

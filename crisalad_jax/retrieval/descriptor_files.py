@@ -52,7 +52,7 @@ def read_record(path: pathlib.Path) -> dict[str, Any]:
 
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:
-    """List the files of descriptors in `path`: the file itself, that of the names, and the record.
+    """List the files of descriptors in `path`: the file itself, its names (.npy) and its record.
 
     Raises:
         InputError: the suffix is neither .npy nor .h5.
@@ -91,7 +91,7 @@ def write_descriptors(
         written: a .npy file of the descriptors on the same disk, to be moved instead of copied.
 
     Raises:
-        InputError: another suffix, a repeated name in a .h5, or a file that cannot be written.
+        InputError: the suffix is unknown, a .h5 repeats a name, or a file cannot be written.
     """
     path = pathlib.Path(path)
     targets(path)
@@ -204,7 +204,7 @@ def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptor
 def read_descriptors(
     path: str | os.PathLike[str], *, verify: bool = True
 ) -> tuple[list[str], Descriptors]:
-    """Read names and descriptors of any float type, from `write_descriptors` or hloc.
+    """Read the names and descriptors (of any float type) that `write_descriptors` or hloc wrote.
 
     A .npy file is memory-mapped: its rows are read when they are used. If the files have no record
     of their digests, a warning says so.
@@ -214,8 +214,8 @@ def read_descriptors(
         verify: whether to read the files completely, and compare them with their digests.
 
     Raises:
-        InputError: the file, or the names next to a .npy, is missing, incomplete, from another set,
-            or holds something else.
+        InputError: the suffix is unknown; or the file, or the list of names next to a .npy, is
+            missing, incomplete, from another set, or holds something else.
     """
     path = pathlib.Path(path)
     readers = {".npy": _read_npy, ".h5": _read_h5}

@@ -120,9 +120,9 @@ def extract(
         Names and descriptors of the images that could be read.
 
     Raises:
-        InputError: parameters or components that do not fit the model; an invalid argument; no
-            cluster at the address; no images, an unreadable image, or no readable one; a name that
-            is not a line of text or is not under `root`; or a file that cannot be read or written.
+        InputError: the parameters or components do not fit the model; an argument is invalid; no
+            cluster is at the address; no image is readable, or an unreadable one is not skipped; a
+            name is not a line of text or not under `root`; or a file cannot be read or written.
 
     Example:
         >>> import jax
@@ -189,8 +189,8 @@ def check_extraction(out: StrPath | None, *, grouping: str, seed: int, cluster: 
         cluster: the address of a Ray cluster.
 
     Raises:
-        InputError: an unknown suffix or grouping; a file that cannot be created; a number out of
-            range; or an invalid address of a cluster.
+        InputError: the suffix of `out` or the grouping is unknown; a file cannot be created; the
+            seed is out of range; or the address of the cluster is invalid.
 
     Example:
         >>> check_extraction("descriptors.npy", grouping="single", seed=0, cluster=None)

@@ -2,7 +2,7 @@
 
 A graph (HNSW: Malkov and Yashunin, 2018) stores the descriptors as they are and finds nearly all
 neighbours. IVF-RaBitQ (Gao and Long, 2024) stores one bit per dimension in lists of similar
-vectors, and compares only the lists nearest to a query; rank its results again.
+vectors, and compares only the lists nearest to a query; rank its results by exact similarity.
 `recall_against_exact` measures the share found. Reduce thousands of dimensions first (`pca`).
 """
 
@@ -29,8 +29,8 @@ from crisalad_jax.utils.shapes import Float, Int
 faiss: Any = _faiss  # its classes are created at import
 Kind = Literal["hnsw", "ivf-rabitq"]
 KINDS: dict[str, None] = dict.fromkeys(get_args(Kind))
-"""A graph over the unchanged descriptors ("hnsw"), nearly exact and as large as they are; or lists
-of their signs ("ivf-rabitq"), 80 bytes each for 512 dimensions, to be ranked again."""
+"""A graph over the unchanged descriptors ("hnsw"), nearly exact and larger than they are; or lists
+of their signs ("ivf-rabitq"), 80 bytes for a descriptor of 512 dimensions, to be ranked again."""
 _LINKS = 32
 """Number of links of a vector in each layer of the graph; twice as many in the lowest. FAISS
 recommends 4 to 64 and the paper 5 to 48, with more for longer vectors."""
@@ -82,8 +82,8 @@ class Index(NamedTuple):
             without: indices to exclude; None excludes none.
 
         Raises:
-            InputError: queries of another length, not finite or not of unit length; k or effort
-                below 1.
+            InputError: the queries have another length, or are not finite or not of unit length; or
+                k or effort is below 1.
         """
         check_count("k", k)
         check_count("effort", 1 if effort is None else effort)
@@ -116,7 +116,7 @@ class Index(NamedTuple):
             quiet: whether to hide the progress bar.
 
         Raises:
-            InputError: rows that are not finite or not of unit length.
+            InputError: a row is not finite or not of unit length.
         """
         with progress_bar(self.kind, count, "rows", quiet=quiet) as bar:
             for part in parts:
@@ -124,7 +124,7 @@ class Index(NamedTuple):
                 bar.advance(len(part))
 
     def has_room_for(self, count: int) -> bool:
-        """Return whether a new index of `count` descriptors would at most double the lists."""
+        """Return whether a new index of `count` descriptors has at most twice this one's lists."""
         index = self.faiss_index
         return self.kind == "hnsw" or 2 * _lists(index).nlist >= _list_count(count, index.d)
 
@@ -154,8 +154,8 @@ def build(kind: Kind, database: Descriptors | Parts, *, seed: int = 0, quiet: bo
         quiet: whether to hide the progress bar.
 
     Raises:
-        InputError: an unknown kind; an array that is empty or not a matrix; rows that are not
-            finite or not of unit length.
+        InputError: the kind is unknown; the array is empty or not a matrix; or a row is not finite
+            or not of unit length.
     """
     choose("kind", kind, KINDS)
     parts = database if callable(database) else _parts_of(as_rows(database, "database"))

@@ -52,7 +52,7 @@ class Grouping:
         A number of images may follow, as in "sequential@26"; see `batch_size`.
 
         Raises:
-            InputError: an unknown grouping, more than two, or an invalid size.
+            InputError: a grouping is unknown, there are more than two, or the size is invalid.
         """
         names, at, size = text.partition("@")
         kinds, expected = names.split("/"), None
@@ -95,7 +95,7 @@ def parse_groupings(texts: Iterable[str]) -> list[Grouping]:
     """Parse protocols in order, without repeats.
 
     Raises:
-        InputError: what `Grouping.parse` raises.
+        InputError: `Grouping.parse` does not accept one of them.
     """
     return list(dict.fromkeys(map(Grouping.parse, texts)))
 

@@ -70,10 +70,10 @@ ReadRows = Callable[[Int64[np.ndarray, " m"]], Float[np.ndarray, "m d"]]
 
 
 def rounding(length: int) -> float:
-    """Bound the rounding error of float32 inner products of unit descriptors of this length n.
+    """Return a bound on the rounding error of float32 inner products of unit descriptors.
 
-    For any order of summation, it is the product of the norms times 8 sqrt(n) 2^-24: the bound of
-    Higham and Mary (2019) with lambda = 8, which fails less than once in 10^9 products.
+    In n dimensions, for any order of summation, it is the norms' product times 8 sqrt(n) 2^-24: the
+    bound of Higham and Mary (2019) with lambda = 8, which fails less than once in 10^9 products.
     """
     return 8 * math.sqrt(length) * 2.0**-24 * (1 + UNIT_TOLERANCE) ** 2
 
@@ -84,7 +84,7 @@ def exact_similarities(
     query: Int[np.ndarray, " pair"],
     row: Int[np.ndarray, " pair"],
 ) -> Float32[np.ndarray, " pair"]:
-    """Compute queries[query] . rows[row] by pair, in float64 in a fixed order, as float32."""
+    """Compute queries[query] . rows[row] per pair: float64 sums in a fixed order, as float32."""
     similarities = np.empty(len(query), np.float32)
     size = max(1, _PIECE // queries.shape[1])
     for start in range(0, len(query), size):
@@ -151,9 +151,9 @@ def nearest(
     """Find the k most similar rows for each query, exactly; ties go to the lower indices.
 
     The candidates of a query are the k + 16 rows with its largest float32 products. Those that may
-    be among the k best, given the rounding error, are compared by `exact_similarities`. If other
-    rows may be too, as with many copies of an image, the database is read again, and all rows whose
-    products are close to the k-th similarity are compared exactly.
+    be among the k best, given the rounding error, are compared by `exact_similarities`. If further
+    rows may be among the k best, as with many copies of an image, the database is read again, and
+    all rows whose products are close to the k-th similarity are compared exactly.
 
     Args:
         stream: yields the blocks of a database of at least k rows.

@@ -55,7 +55,7 @@ class Pca(NamedTuple):
 
     mean: Float32[np.ndarray, " d"]
     components: Float32[np.ndarray, "dim d"]
-    """Orthonormal rows by descending variance, each with a positive entry of largest magnitude."""
+    """Orthonormal rows by descending variance; the entry of largest magnitude in each is > 0."""
     variances: Float32[np.ndarray, " dim"]
     """Sample variances (divided by n - 1) of the fitted descriptors along the components."""
     total: Float32[np.ndarray, ""]
@@ -73,8 +73,7 @@ class Pca(NamedTuple):
         """Reduce descriptors to their components, in float32, some rows at a time.
 
         Raises:
-            InputError: descriptors that are not a matrix, are not finite, or have another length
-                than those that were fitted.
+            InputError: `descriptors` is not a finite (n, d) matrix, where d is the fitted length.
         """
         if len(descriptors):  # a batch may have no readable image
             descriptors = as_rows(descriptors, "descriptors", len(self.mean))
@@ -125,8 +124,8 @@ def shortened(
         The length of the resulting descriptors, and whether they are unit vectors.
 
     Raises:
-        InputError: the components were fitted to other descriptors, or unit vectors are required
-            and these are not.
+        InputError: the components were fitted to other descriptors, or `unit` is set and the
+            resulting descriptors are not unit vectors.
     """
     config = describer.config
     length, is_unit = config.descriptor_dim, config.unit_length
@@ -181,9 +180,9 @@ def fit_pca(
         The components, for `Pca.apply`.
 
     Raises:
-        InputError: an array that is empty, not a matrix, or has a row that is not finite; fewer
-            than two descriptors or samples; `dim` below 1, or above the rank of the fitted
-            descriptors; a negative seed.
+        InputError: the array is empty, is not a matrix, or has a row that is not finite; there are
+            fewer than two descriptors or samples; `dim` is below 1, or above the rank of the fitted
+            descriptors; or the seed is negative.
 
     Example:
         >>> import numpy as np
@@ -253,7 +252,8 @@ def project_to_plane(descriptors: Descriptors) -> Plane:
         Positions relative to the mean, and the share of the variance along each axis.
 
     Raises:
-        InputError: fewer than three descriptors, or all on a line; or an array `fit_pca` refuses.
+        InputError: there are fewer than three descriptors, or all lie on a line; or `fit_pca`
+            refuses the array for another reason.
 
     Example:
         >>> import numpy as np

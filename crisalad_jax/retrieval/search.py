@@ -69,9 +69,8 @@ def search(
         Indices into the database and similarities, (q, k), best first.
 
     Raises:
-        InputError: an array that is empty, not a matrix, or has a row that is not finite or not of
-            unit norm; descriptors of different lengths; bits on only one side; k or chunk below
-            1.
+        InputError: an array is empty, is not a matrix, or has a row that is not finite or not of
+            unit norm; descriptors differ in length; only one side has bits; k or chunk is below 1.
 
     Example:
         >>> import numpy as np

@@ -25,7 +25,7 @@ from crisalad_jax.utils.files import atomic_path, read_json
 from crisalad_jax.utils.shapes import Int64
 
 SEGMENT = 256
-"""Number of images appended together, and so the most to be described again after a kill."""
+"""Images per segment, rounded up to whole batches; a kill loses at most one segment of work."""
 
 
 Take = Callable[[Mapping[str, Any], pathlib.Path], None]

@@ -36,10 +36,10 @@ class SeqSlam:
     over the surrounding images is subtracted, and the result divided by their standard deviation.
     The score of an image is the smallest sum of enhanced differences along a line that ends at this
     image in the latest frame. Lines have velocities from `slowest` to `fastest` in steps of 0.1
-    images of the map per frame, and are rounded to the nearest image; before the first image, they
-    stay at it. The belief in an image is the softmax of its negative score, which is not in the
-    paper. The paper also compares images not by cosine, but by sums of absolute differences of
-    small, patch-normalised images (the model `thumbnail`).
+    images of the map per frame, and are rounded to the nearest image; where a line would pass the
+    first image, it stays there. Two things differ from the paper: the belief in an image is the
+    softmax of its negative score, and images are compared by cosine rather than by sums of
+    absolute differences of small, patch-normalised images (those of the model `thumbnail`).
 
     Args:
         length: number of latest frames that a line goes through.
@@ -48,7 +48,7 @@ class SeqSlam:
         fastest: highest velocity.
 
     Raises:
-        InputError: a number out of range.
+        InputError: a number is out of range.
 
     Example:
         >>> import numpy as np
@@ -87,7 +87,7 @@ class SeqSlam:
             common: a value for each image; only their number is used.
 
         Raises:
-            InputError: no images, or a value that is not finite.
+            InputError: there are no images, or a value is not finite.
         """
         common = checked("common", common, (max(1, np.size(common)),))
         count = len(common)
@@ -105,7 +105,7 @@ class SeqSlam:
             The state after this frame.
 
         Raises:
-            InputError: similarities that are not one finite number per image.
+            InputError: `similarities` is not one finite number per image.
         """
         differences = 1 - checked("similarities", similarities, state.common.shape)
         enhanced = self.enhance(differences)[None]

@@ -60,14 +60,13 @@ class BayesFilter:
     of the map counts as ten frames.
 
     Args:
-        reach: the largest motion of the camera: images of the map per frame, seconds per second, or
-            metres per metre.
+        reach: the largest motion of the camera, in the units described above.
         jump: probability that the camera jumps to any image, above 0 and below 1.
         sharpness: weight of a frame relative to the frames before it.
         adapt: whether to subtract the mean of each side.
 
     Raises:
-        InputError: a number out of range.
+        InputError: a number is out of range.
 
     Example:
         >>> import numpy as np
@@ -104,8 +103,8 @@ class BayesFilter:
             The state before the first frame.
 
         Raises:
-            InputError: no images, a similarity that is not finite, or an `along` that decreases or
-                has another length.
+            InputError: there are no images, a similarity is not finite, or `along` decreases or has
+                another length.
         """
         common = checked("common", common, (max(1, np.size(common)),))
         count = len(common)
@@ -149,7 +148,7 @@ class BayesFilter:
             The state after this frame.
 
         Raises:
-            InputError: `moved` below 0, or similarities that are not one finite number per image.
+            InputError: `moved` is below 0, or `similarities` is not one finite number per image.
         """
         require(moved >= 0, f"moved: found {moved}, expected at least 0")
         row = checked("similarities", similarities, state.common.shape)
@@ -178,10 +177,10 @@ class BayesFilter:
             moved: motion before each frame, as in `step`; None is 1 for each.
 
         Returns:
-            The best place at each frame, given that frame and those before it.
+            The most probable image at each frame, given that frame and those before it.
 
         Raises:
-            InputError: `moved` of another length, or what `start` and `step` raise.
+            InputError: `moved` has another length, or `start` or `step` refuses an argument.
         """
         state, places, probabilities = self.start(common, along), [], []
         steps = np.ones(len(similarities)) if moved is None else np.asarray(moved)
@@ -201,7 +200,8 @@ class Followed(NamedTuple):
     places: Int64[np.ndarray, " frame"]
     """Index of the most probable image of the map."""
     probabilities: Float64[np.ndarray, " frame"]
-    """Probability that the camera is there; it is shared with similar images nearby."""
+    """Probability that the camera is at this image. Similar images nearby divide the probability
+    among themselves, so it can be low for each."""
 
 
 def checked(name: str, values: PerPlace, shape: tuple[int, ...]) -> PerPlace:

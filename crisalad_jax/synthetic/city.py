@@ -67,8 +67,8 @@ def write_synthetic_city(
     """Render the city into `root`, completely or not at all.
 
     `root/train` has the GSV-Cities layout with two cities. `root/test` has that of
-    VPR-datasets-downloader (`images/test/{database,queries}`). Places are 80 m apart and the images
-    of one within 10 m, so a radius of 25 m separates positives; training and test places differ.
+    VPR-datasets-downloader (`images/test/{database,queries}`). Places are 80 m apart and a place's
+    images within 10 m, so a radius of 25 m separates positives; training and test places differ.
     The configuration is in `root/set.json`; a root that already holds this city is not changed.
 
     Args:

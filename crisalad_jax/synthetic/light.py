@@ -137,7 +137,7 @@ def part_colours(
 def shining(
     scene: Scene, draw: Float[np.ndarray, " polygon"], lit: float
 ) -> Bool[np.ndarray, " polygon"]:
-    """Choose the polygons that shine: `draw` is below their `GLOW` share, scaled by `lit`."""
+    """Choose the polygons that shine: where `draw` is below their `GLOW` share, scaled by `lit`."""
     gain = 0.35 + 0.65 * lit if lit else 0.0
     share = _by_kind(scene, {kind: share * gain for kind, (share, _) in GLOW.items()})
     return draw < np.repeat(share, scene.part_sizes)

@@ -93,7 +93,7 @@ def rects(
 def bars(
     x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0, top: Number | None = None
 ) -> Polygons:
-    """Make upright bars, `half` metres to either side of x; they may taper to `top` metres."""
+    """Make upright bars that extend `half` metres to either side of x, or `top` at the top."""
     top = half if top is None else top
     return polygons((x - half, y0, z), (x + half, y0, z), (x + top, y1, z), (x - top, y1, z))
 
@@ -155,14 +155,14 @@ class Mesh:
         self._parts: list[tuple[np.ndarray, Paint, Vector, int, float]] = []
 
     def at(self, x: float, z: float, layer: float | None = None) -> "Mesh":
-        """Return this mesh with its origin at (x, z), adding to `layer`; None is layer z."""
+        """Return a mesh with origin (x, z) that adds to this one, in `layer`; None is layer z."""
         here = copy.copy(self)
         here._origin = self.world(np.array((x, 0.0, z)))
         here.layer = float(z if layer is None else layer)
         return here
 
     def front(self, x: float, z: float, side: float, layer: float | None = None) -> "Mesh":
-        """Return this mesh in the axes (u, v, d) of a vertical plane, such as a row of houses.
+        """Return a mesh that adds to this one, in axes (u, v, d) of a plane such as a house front.
 
         u runs along the plane, v up, d out of it. The origin is (x, z). The plane is along the left
         or right side of the street if `side` is -1 or 1, and across the street if `side` is 0.

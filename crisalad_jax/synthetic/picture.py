@@ -58,7 +58,7 @@ def render(
         scenery: kind of place, of `SCENERIES`.
 
     Raises:
-        InputError: a negative seed, or a size out of range.
+        InputError: the seed is negative, or a side is not from 16 to 2048 pixels.
     """
     check_size("image_size", image_size)
     require(place_seed >= 0, f"place_seed: found {place_seed}, expected at least 0")

@@ -58,7 +58,7 @@ class View:
     exposure: float = 0.0
     """Exposure in stops, relative to the default."""
     noise: Annotated[float, limited(0, 255)] = 0.0
-    """Standard deviation of the sensor noise, in grey levels of 255."""
+    """Standard deviation of the sensor noise, in grey levels, which are 0 to 255."""
     seed: int = 0
     """Seed of the sun's position, clouds, rain, lit windows, white balance and noise."""
 

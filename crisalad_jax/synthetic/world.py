@@ -65,9 +65,9 @@ class WorldConfig:
     """Maximum of `View.repaint`, which is drawn for each image."""
     varied: tuple[Variation, ...] = VARIATIONS
     """What varies between the training images of a place. Other fields have the defaults of `View`;
-    without "stand", all images share one camera of the scene. Test images vary in everything."""
+    without "stand", all images of a place share one camera pose. Test images vary in everything."""
     hard: Annotated[float, limited(0, 1)] = 0.3
-    """Share of hard images: from farther to the side, turned, and sometimes through a crowd."""
+    """Share of hard images, taken from farther to the side, turned, some through a crowd."""
     seed: Seed = 0
 
     def __post_init__(self) -> None:

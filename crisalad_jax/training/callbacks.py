@@ -88,7 +88,7 @@ def register_callback(name: str) -> Callable[[_C], _C]:
         The decorator, for a class that inherits from `Callback` and is made without arguments.
 
     Raises:
-        InputError: on decoration, if the name is taken or the object is not such a class.
+        InputError: on decoration, the name is taken, or the object is not such a class.
 
     Example:
         >>> @register_callback("print-recall")

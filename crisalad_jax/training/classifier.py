@@ -39,8 +39,8 @@ def init_classifiers(
         dim: width of a descriptor.
 
     Raises:
-        InputError: there is no key for a loss with parameters, or no classes for one that
-            classifies.
+        InputError: there is no key for a loss with parameters, or there are no classes for a loss
+            that classifies.
     """
     name = f"loss {loss.part_name}"
     shapes = jax.eval_shape(lambda key: loss.init(key, 1, dim), jax.random.key(0))

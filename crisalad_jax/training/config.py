@@ -62,8 +62,8 @@ class OptimiserConfig:
     """Maximum absolute value of a gradient element, after `clip_norm`; None is no limit."""
     accumulate: PositiveInt = 1
     """Number of batches whose gradients are averaged for one optimiser step. `warmup_steps` counts
-    these steps. As in Lightning, the last batch of an epoch always takes a step; the sum of the
-    gradients left for it is divided by the same number."""
+    these steps. As in Lightning, an epoch always ends with a step; if fewer batches are left for
+    it, their summed gradient is still divided by this number."""
     ema: Fraction | None = None
     """Decay of an exponential moving average of the weights per optimiser step, such as 0.999;
     validation and saved weights use the average. None turns it off."""
@@ -91,8 +91,8 @@ class MiningConfig:
 
     kind: Literal["none", "whole", "sample"] = "none"
     """Database images that a round describes: "none", to train on places without mining; the
-    "whole" database, from which each query draws candidates and adds its last negatives (NetVLAD);
-    or a "sample" of candidates for all queries of the round, and their positives (MSLS)."""
+    "whole" database, where each query draws candidates and reuses its last negatives (NetVLAD); or
+    a "sample" of candidates for all queries of the round, and their positives (MSLS)."""
     negatives: PositiveInt = 10
     """Number of negatives per tuple: the candidates nearest to the query by descriptor."""
     candidates: PositiveInt = 1000
@@ -163,7 +163,7 @@ class TrainConfig:
     optimiser: OptimiserConfig = OptimiserConfig(
         schedule=LinearSchedule(end_fraction=0.2, decay_steps=4000)
     )
-    """By default the paper's AdamW; rate decay "as adopted in SALAD", by 80 % in 4,000 steps."""
+    """By default the paper's AdamW; the rate falls by 80 % in 4,000 steps "as adopted in SALAD"."""
     trainable: str = ADAPTERS_AND_HEAD
     """What trains, comma-separated: adapters,head (the paper); last-N-blocks,norm,head (SALAD);
     all; or patterns of names, as in adapters,head,backbone.blocks.1[01]. A leading - freezes a word
@@ -197,8 +197,8 @@ class TrainConfig:
     cities: tuple[str, ...] | None = None
     """Cities of the training set to use; None uses all."""
     epochs: PositiveInt = 8
-    """Passes over the training set; a larger number extends an existing run. The paper converged
-    within five, and stopped after three without gain."""
+    """Passes over the training set; a larger number extends an existing run. The paper's training
+    converged within five, and stopped after three without gain."""
     validate_every: PositiveInt = 1
     """Number of epochs from one validation to the next."""
     validation_size: tuple[int, int] | None = None
@@ -209,7 +209,7 @@ class TrainConfig:
     patience: PositiveInt | None = 3
     """Number of validations without a better recall after which training stops; None for never."""
     save_top_k: PositiveInt = 1
-    """Number of validations whose weights are saved, by best recall."""
+    """Number of best validations, by recall, whose weights are saved."""
     seed: Seed = 0
     """Seed of weights, batches and augmentations."""
 
@@ -295,7 +295,7 @@ class TrainConfig:
         return tuple(found) or (self,)
 
     def with_each(self, **changes: Callable[[Any], Any]) -> "TrainConfig":
-        """Apply functions, by field (sampler, loss), to the run or to each set of its mixture."""
+        """Apply functions, by field (sampler, loss), to the run or, for a mixture, to each set."""
 
         def changed(each: Any) -> Any:
             values = {name: change(getattr(each, name)) for name, change in changes.items()}

@@ -41,9 +41,9 @@ def join_processes(
         count: number of processes; None with "auto".
         index: number of this process, from 0; None with "auto".
         local_device_ids: numbers of this process's GPUs on its host. None is the number of the
-            process on its host, if a launcher (Slurm, Open MPI) or "auto" gives it, or if all are
-            on one host (a coordinator at localhost). Otherwise, or if the process sees only one
-            GPU, it is all GPUs that the process sees.
+            process on its host, if a launcher (Slurm, Open MPI) or "auto" gives it, or if all
+            processes are on one host (a coordinator at localhost). Otherwise, or if the process
+            sees only one GPU, it is all GPUs that the process sees.
 
     Raises:
         InputError: the arguments do not fit together, or other processes cannot be reached.
@@ -144,7 +144,7 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
     """Run `work` only in the primary process; return its result, a JSON value, in every process.
 
     Raises:
-        InputError, Interrupted: in every process, if `work` raises, as `raise_together` does.
+        InputError, Interrupted: `work` has failed; all processes raise, as in `raise_together`.
     """
     value: Any = raise_together(lambda: work() if is_primary() else None)
     if jax.process_count() == 1:
@@ -170,7 +170,7 @@ def check_same(numbers: Mapping[str, int]) -> None:
     """Check that all processes pass the same numbers, named for messages.
 
     Raises:
-        InputError: in every process, if a number differs between processes.
+        InputError: a number differs between processes; every process raises the error.
     """
     gathered = _gather(*numbers.values())
     is_other = gathered != gathered[0]

@@ -58,7 +58,7 @@ def gradient_norms(
         that do not train are left out.
 
     Raises:
-        InputError: nothing would train; no key for a loss with parameters; the step of
+        InputError: nothing would train; there is no key for a loss with parameters; the step of
             `make_train_step` refuses the batch; or the loss classifies: only a run has its classes.
 
     Example:

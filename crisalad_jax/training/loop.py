@@ -63,7 +63,7 @@ class FitResult(NamedTuple):
     """Parameters of the whole model after the last step."""
     steps: int
     best_recall: float | None
-    """Best validation recall by `TrainConfig.monitor`, as a fraction; None without validation."""
+    """Best recall by `TrainConfig.monitor`, 0 to 1 (R@1+R@5: 0 to 2); None without validation."""
     stopped_early: bool
     """Whether the run ended before its last epoch, by `TrainConfig.patience` or a callback."""
     skipped_images: int
@@ -114,9 +114,9 @@ def fit(
         shard_state: whether to shard trainable parameters and their moments over the devices.
         cache_gb: maximum gigabytes (1e9 bytes) of remote images cached on this host's disk, in the
             folder `images` of this package's cache; 0 caches none.
-        callbacks: called with the metrics of each step and validation, in the primary process; or
-            names of registered ones. If one raises `StopTraining`, the run ends; the same call
-            resumes it.
+        callbacks: objects that are called with the metrics of each step and validation, in the
+            primary process; or names of registered callbacks. If one raises `StopTraining`, the run
+            ends; the same call resumes it.
         quiet: whether to hide the progress bar.
         targets: a teacher's unit descriptor of each image of `places`, possibly a memory map, for a
             loss that learns from them; all-zero rows leave their images out.

@@ -1,8 +1,8 @@
-"""End a process with a one-line error if another process of its run, or its host, is lost.
+"""End a process with a one-line error if its run loses another process or that process's host.
 
 JAX ends the remaining processes in one of two ways. If the kernel of the lost process's host closes
 its connections, the next exchange of arrays raises an error. Otherwise JAX's coordination service
-misses its heartbeats, and aborts each process in C++, at any point, with a page of messages.
+misses that process's heartbeats, and aborts the others in C++, at any point, with a page of text.
 """
 
 import atexit
@@ -70,7 +70,7 @@ def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
     This process later exits without JAX's shutdown, which would wait for the lost process.
 
     Raises:
-        InputError: in place of JAX's error when an exchange with another process fails.
+        InputError: an exchange with another process failed; this replaces JAX's error.
     """
 
     @functools.wraps(function)

@@ -1,4 +1,4 @@
-"""Mine tuples: a query, its nearest positive and its hardest negatives, by the current model.
+"""Mine tuples with the current model: a query, its nearest positive and its hardest negatives.
 
 It is NetVLAD's cached hard mining (Arandjelovic et al., CVPR 2016), or the partial mining of
 Mapillary's code and Berton et al. (CVPR 2022), with which Patch-NetVLAD and SelaVPR train.
@@ -174,7 +174,7 @@ class Miner:
 
 
 Batches = PlaceBatches | Miner
-"""What yields a run's batches: of places, or of mined tuples."""
+"""Source of a run's batches, which consist of places or of mined tuples."""
 
 
 def _distances(

@@ -1,4 +1,4 @@
-"""The training sets of a mixture, by their names."""
+"""Select the training sets of a mixture by name, and check the names that are given."""
 
 import dataclasses
 from collections.abc import Collection, Sequence
@@ -11,8 +11,8 @@ from crisalad_jax.training.losses import LossConfig
 def with_sets(config: TrainConfig, names: Sequence[str]) -> TrainConfig:
     """Adapt a configuration to the given training sets.
 
-    A mixture is reduced to these sets, each with as many places per batch as before. Without one,
-    the sets form a mixture: each has the configuration's sampler and loss, and equally many places.
+    A mixture is reduced to these sets, each with as many places per batch as before. If there is no
+    mixture, the sets form one: all have the configuration's sampler and loss, and equal shares.
 
     Args:
         config: the configuration of a recipe or an earlier run.

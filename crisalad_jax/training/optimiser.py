@@ -15,7 +15,7 @@ from crisalad_jax.training.schedules import RunSteps
 from crisalad_jax.utils.output import warn
 
 WARMUP_SHARE = 4
-"""Limit of a warm-up: a run's steps divided by this, as in BoQ (10 of 40 epochs)."""
+"""A warm-up is at most a run's steps divided by this, as in BoQ (10 of 40 epochs)."""
 
 
 _Count = TypeVar("_Count", int, Array)
@@ -137,7 +137,7 @@ def make_optimiser(
     """Make the optimiser of a run, from `config.kind`.
 
     If `config.clip_norm` or `config.clip_value` is set, the gradient is clipped first; if a step
-    accumulates several batches, that is their mean. The weight average (`config.ema`) comes last.
+    accumulates several batches, their mean gradient is. The weight average (`config.ema`) is last.
 
     Args:
         config: the optimiser's configuration.

@@ -64,7 +64,7 @@ class RunRecord:
     validated: int = 0
     """Step of the last validation."""
     best: list[list[Any]] = dataclasses.field(default_factory=list)
-    """[recall, step] of the best validations, best first; the recall of `TrainConfig.monitor`."""
+    """[recall, step] of the best validations, best first; the recall is `TrainConfig.monitor`'s."""
     without_gain: int = 0
     """Number of validations since the best one."""
     stopped_early: bool = False
@@ -145,13 +145,13 @@ class RunFiles:
         return state
 
     def log(self, values: Mapping[str, int | float], *, of: str = "") -> None:
-        """Append a line to the log, in the primary process; `of` is a validation's benchmark."""
+        """Append a line to the log, in the primary process; `of` names a validation's benchmark."""
         if distributed.is_primary():
             with wrap_os_errors(self.out):
                 self._log.write(values, of=of)
 
     def save_if_best(self, params: Crisalad, loss: PyTree) -> None:
-        """Write the weights of this step, if the record counts it among the best.
+        """Write the weights of this step if it is among the best steps recorded so far.
 
         Args:
             params: the model's parameters.
@@ -172,7 +172,7 @@ class RunFiles:
         save_weights(path, Model(params, self._config.model), loss=saved)
 
     def save_is_due(self) -> bool:
-        """Return whether the last save is over `SAVE_SECONDS` ago, in the primary process only."""
+        """Return whether this process is primary and its last save is over `SAVE_SECONDS` ago."""
         return distributed.is_primary() and time.monotonic() - self._saved_at > SAVE_SECONDS
 
     def save(self, state: RunState, params: Callable[[], Crisalad]) -> None:
@@ -299,7 +299,7 @@ def write_data(
 
 
 def checksum_of_places(places: TrainingSet) -> int:
-    """Compute the CRC-32 of all images' names and places, or of a `QuerySet`'s positives."""
+    """Compute the CRC-32 of image names and of their places or, in a `QuerySet`, their pairs."""
     if isinstance(places, Mapping):
         return checksum(map(checksum_of_places, sets_of(places)))
     if isinstance(places, QuerySet):

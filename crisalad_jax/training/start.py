@@ -70,7 +70,7 @@ def read_inputs(
         (training set, validation set or None, initial parameters or None for random ones).
 
     Raises:
-        InputError: in every process, if any process cannot read its files or they do not fit.
+        InputError: a process cannot read its files, or they do not fit; all processes raise it.
     """
     quiet = quiet or not distributed.is_primary()
 
@@ -162,7 +162,7 @@ def read_start(
         All parameters; None, which stands for random ones, without `weights` and `backbone`.
 
     Raises:
-        InputError: both are given, or a file cannot be read or does not fit the model.
+        InputError: `weights` and `backbone` are both given, or a file is unreadable or unsuitable.
     """
     both = weights is not None and backbone is not None
     require(not both, "--backbone: found together with --weights, expected only one of the two")
@@ -187,7 +187,7 @@ def with_vocabulary_of(
 ) -> Crisalad | None:
     """Fit an aggregator's centroids to the training images, if it starts from centroids.
 
-    The same start always gives the same centroids, so that runs can resume. All processes call it
+    The same arguments give the same centroids, so that runs can resume. All processes call this
     together, and each gets the centroids of the primary process.
 
     Args:

@@ -95,7 +95,7 @@ class Metrics(NamedTuple):
 
 
 def named_scalars(values: Metrics | TransportStatistics) -> dict[str, float]:
-    """Return scalars by name, without None or the prefix `transport.`; a loss's are `loss.NAME`."""
+    """Return named scalars, without None; `transport.` is cut, `loss_numbers.` becomes `loss.`."""
     return {
         name.removeprefix("transport.").replace("loss_numbers.", "loss.", 1): float(leaf)
         for name, leaf in named_leaves(values).items()
@@ -177,8 +177,9 @@ def init_train_state(
         (state, frozen). The state is a copy, so `params` can still be used.
 
     Raises:
-        InputError: `trainable` does not fit the model; no parameter would train, or the aggregator
-            (AnyLoc's) cannot be trained; or the loss lacks a key or numbers of classes.
+        InputError: `trainable` does not fit the model; no parameter would train; the aggregator
+            (AnyLoc's) cannot be trained; the loss needs a key or numbers of classes that are not
+            given; or a loss of a mixture has parameters of its own.
 
     Example:
         >>> import jax
@@ -348,8 +349,8 @@ def train_step(
     group of classes of the current epoch trains, and labels are classes of that group. Dropout is
     drawn from `key` and the step number, so that a resumed run repeats an uninterrupted one.
 
-    Batch-norm statistics in the state are updated as in torch's training mode, and the batch is
-    normalised by its own. If the state has none, the stored statistics normalise it.
+    Running batch-norm statistics in the state are updated as in torch's training mode, and a batch
+    is normalised by its own statistics; if the state has none, by the stored ones in `frozen`.
 
     If the loss or the gradient is not finite, or no image is valid, the state is returned unchanged
     and `Metrics.updated` is False. Passed to the next step as `proceed`, False skips it too, so a
@@ -404,7 +405,7 @@ class BatchLoss(NamedTuple):
     statistics: PyTree
     """Running statistics of batch norms after the batch."""
     valid: Bool[Array, " image"]
-    """Which images are valid, on all devices."""
+    """Whether each image of the batch is valid; the whole mask is on every device."""
 
 
 def loss_and_gradient(
@@ -430,8 +431,7 @@ def loss_and_gradient(
         targets: a teacher's descriptors of the images, for a loss that compares them.
 
     Returns:
-        The results of the forward pass, and the gradients of the trainable parameters and of the
-        loss's parameters.
+        The results of the forward pass, and the gradients of trainable and of loss parameters.
     """
     classifier, group = None, _group(state, config)
     if state.classifiers is not None:

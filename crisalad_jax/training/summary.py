@@ -1,4 +1,4 @@
-"""The parts of a model: parameters, what trains, multiply-accumulates per image."""
+"""Count a model's trainable and frozen parameters, and its multiply-accumulates per image."""
 
 from typing import Any, NamedTuple
 
@@ -38,7 +38,7 @@ class ModelSummary(NamedTuple):
     trainable_parameters: int
     frozen_parameters: int
     parts: list[PartCost]
-    """A row for each part."""
+    """Parameters and multiply-accumulates of each part."""
     one_adapter: AdapterSummary | None
     """Counts of one adapter; None if there are no adapters."""
 

@@ -76,8 +76,8 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
         (trainable, frozen): two trees of the model's structure, with None for the other's leaves.
 
     Raises:
-        InputError: parameters of another model; a word or pattern that matches nothing; or adapters
-            or a part of the head are left out without a `-`, and would stay as initialised.
+        InputError: the parameters belong to another model than `config`; a word or pattern matches
+            nothing; or adapters or a part of the head neither train nor are frozen by a `-`.
 
     Example:
         >>> import jax
@@ -210,10 +210,10 @@ def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Cris
         config: the model's configuration.
 
     Returns:
-        The whole model, with its blocks joined again.
+        The whole model, with the blocks that `split_params` separated joined again.
 
     Raises:
-        InputError: parameters of another model.
+        InputError: the parameters belong to another model than `config`.
 
     Example:
         >>> import jax

@@ -151,7 +151,7 @@ class Trainer:
         return self._devices.gather(tree)
 
     def params(self, trainable: PyTree = None) -> Crisalad:
-        """Return the model in float32, with gathered `trainable` parameters; None gathers them."""
+        """Return the float32 model with gathered `trainable`; None gathers `state.averaged`."""
         if trainable is None:
             trainable = self.gather(self.state.averaged)
         return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)

@@ -22,7 +22,7 @@ from crisalad_jax.training.step import named_scalars
 WATCHED_QUERIES = 16
 """Number of queries whose mean transport statistics every validation logs."""
 MONITORED = {"R@1": (1,), "R@5": (5,), "R@1+R@5": (1, 5)}
-"""Ranks whose recalls are added, by `TrainConfig.monitor`."""
+"""Values of K whose R@K are added, for each value of `TrainConfig.monitor`."""
 DESCRIBED_AT_ONCE = 16
 """Number of images in a batch while tuples are mined."""
 

@@ -64,8 +64,7 @@ def with_vocabulary(
         model: a model with its final backbone, or the one that training starts from, and an
             aggregator that starts from centroids.
         paths: images; not those used for evaluation.
-        images: maximum number of images, drawn at random; None for all, whose features must fit in
-            memory.
+        images: maximum number, drawn at random; None for all, if their features fit in memory.
         seed: seed for drawing images, up to `PATCHES` patches of each, and first centroids.
         batch_size: number of images described at a time.
         on_bad_image: "stop", or "skip" to leave unreadable images out.
@@ -75,9 +74,9 @@ def with_vocabulary(
         The parameters with the centroids.
 
     Raises:
-        InputError: the aggregator has no vocabulary; an argument is out of range; an image, or
-            all, cannot be read; there are fewer features than clusters or than VLAD-BuFF's
-            principal components; or features are not finite, or all equal.
+        InputError: the aggregator has no vocabulary; an argument is out of range; an image (with
+            "skip", every image) cannot be read; there are fewer features than clusters or than
+            VLAD-BuFF's principal components; or features are not finite, or all equal.
     """
     params, config = model
     aggregator = config.aggregator
@@ -151,8 +150,8 @@ def start_vocabulary(
         The model.
 
     Raises:
-        InputError: no such preset or aggregator, or one without a vocabulary; a field that it does
-            not have; or a checkpoint that cannot be read or is of another size.
+        InputError: the preset or aggregator does not exist; the aggregator has no vocabulary, or
+            lacks one of `fields`; or the checkpoint cannot be read or is of another size.
     """
     # A recipe that mines has another backbone than the preset's: for NetVLAD the head is meant.
     is_head = aggregator in AGGREGATORS and mines_tuples(aggregator)
@@ -207,7 +206,8 @@ def build_vocabulary(
         The parameters, and the numbers of centroids and images.
 
     Raises:
-        InputError: no vocabulary, too few or unreadable images, or `out` cannot be written.
+        InputError: the aggregator has no vocabulary; images are too few or cannot be read; or `out`
+            cannot be written.
 
     Example:
         >>> import jax

@@ -76,8 +76,8 @@ def connected(address: str) -> Iterator[Any]:
             HOST:PORT is the address of a cluster that this machine is a node of.
 
     Raises:
-        InputError: not an address; Ray is not installed; there is no such cluster; it has another
-            version of Ray or Python; or it is lost during the block.
+        InputError: `address` is invalid; Ray is not installed; the cluster does not exist,
+            has another version of Ray or Python, or is lost during the block.
     """
     there = check_cluster(address)
     for name, value in _SETTINGS.items():
@@ -308,8 +308,8 @@ def map_in_order(
         environment: environment variables that are set in each process before `prepare`.
 
     Raises:
-        InputError: an InputError of `work`, with the node's name; workers end repeatedly; or none
-            has a result within `RESULT` seconds.
+        InputError: `work` raises one (the node's name is added); workers end repeatedly; no worker
+            starts within `START` seconds; or none has a result within `RESULT` seconds.
     """
     count, resources = _slots(ray)
     remote = ray.remote(_Worker).options(**resources, scheduling_strategy="SPREAD")

@@ -57,7 +57,7 @@ class Devices(NamedTuple):
         return jax.tree.map(put, tree)
 
     def shard(self, tree: _Tree) -> _Tree:
-        """Shard arrays over the devices by `shard_spec`; all processes give the same full ones."""
+        """Shard arrays over devices by `shard_spec`; all processes pass the same full arrays."""
 
         def put(leaf: Any) -> jax.Array:
             host = np.array(leaf)

@@ -26,7 +26,7 @@ def locate_errors(before: str = "", after: str = "") -> Iterator[None]:
 
 
 def how_ended(number: int) -> str:
-    """Describe how a signal, given by its number, ended a program; the same for every command."""
+    """Describe how a signal, given by its number, ended a program; all commands use these words."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 
 

@@ -17,7 +17,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
 }
-"""Modules of each extra, by its name; if two have the same module, the smaller comes first."""
+"""Modules that each extra installs; of extras that share a module, the smallest comes first."""
 
 
 def missing_extra(error: ModuleNotFoundError, what: str) -> str:

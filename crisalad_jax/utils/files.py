@@ -163,7 +163,7 @@ def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = Tru
     Args:
         path: the file.
         expected: what kind of file, for messages.
-        sealed: whether the file must hold a checksum; a user who edits a file removes it.
+        sealed: whether to require a checksum; users have to remove it from a file that they edit.
 
     Returns:
         The value, without its checksum; an object if the file must hold one.
@@ -195,8 +195,8 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
         suffix: what its name has to end with, as in ".safetensors"; None is anything.
 
     Raises:
-        InputError: `path` is a folder, or a pipe or a device that a file would replace; no file can
-            have such a name, or its folder cannot be made or written to; or it has another suffix.
+        InputError: `path` is a folder, a pipe or a device, is not a valid name for a file, or has
+            another suffix; or its folder cannot be made or written to.
     """
     path = pathlib.Path(path)
     if path.name in ("", "-"):
@@ -235,7 +235,7 @@ def check_no_links(folder: pathlib.Path, *, itself: bool = False) -> None:
 
     Args:
         folder: the folder, which need not exist; it may come from somebody else.
-        itself: whether the folder must not be a link either, as for one that the user did not name.
+        itself: whether to reject a link at `folder` too, as for a folder the user did not name.
 
     Raises:
         InputError: a file or a folder in it, at any depth, is a link.
@@ -290,7 +290,7 @@ def wrap_os_errors(path: pathlib.Path) -> Iterator[None]:
     """Turn a disk error in this block into one line that names the file.
 
     Raises:
-        InputError: in place of any `OSError`.
+        InputError: the block raised an `OSError`, which this replaces.
     """
     try:
         yield

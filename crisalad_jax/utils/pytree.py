@@ -68,7 +68,7 @@ def check_drawn(tree: Any, where: str) -> None:
     An empty array cannot be a parameter, because optimisers divide by its size: use None instead.
 
     Raises:
-        InputError: one is not; the message names `where` and the leaf.
+        InputError: a parameter is empty or not float32; the message names it and `where`.
     """
     for name, leaf in named_leaves(tree).items():
         dtype = getattr(leaf, "dtype", type(leaf).__name__)

@@ -1,7 +1,7 @@
 """Types of NumPy arrays with their shapes, for annotations in modules that run without JAX.
 
-To a type checker they are jaxtyping's. At run time they are plain NumPy arrays, and jaxtyping is
-not imported, which would slow down `query` with another runtime.
+To a type checker they are jaxtyping's. At run time they are plain NumPy arrays. jaxtyping is not
+imported, because the import would slow down `query` with a runtime other than JAX.
 """
 
 from typing import TYPE_CHECKING, Any

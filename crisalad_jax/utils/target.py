@@ -46,7 +46,7 @@ CPU, GPU, TPU = Target("cpu"), Target("gpu", cudnn=True), Target("tpu")
 PORTABLE = Target("portable")
 """No platform-dependent choices: a program runs on all platforms."""
 STRAIGHT = Target("portable", branches=False)
-"""No platform-dependent choices or branches: for programs in other formats, for any engine."""
+"""No platform-dependent choices or branches: for ONNX programs, which any engine can run."""
 # JAX's trace cache depends on this: a function traced for one target is traced again for another.
 _chosen = jax.make_user_context(None)
 _mesh = jax.make_user_context(None)
@@ -90,7 +90,7 @@ def absent_platforms(error: Exception | None = None) -> str | None:
     """Describe the platforms in `JAX_PLATFORMS` that this JAX lacks; None if it has them all.
 
     Args:
-        error: what JAX raised; after it, JAX returns the devices that it started before it failed.
+        error: JAX's error, if any; afterwards, JAX returns the devices started before the error.
     """
     named = os.environ.get("JAX_PLATFORMS")
     if not named:

@@ -29,9 +29,9 @@ from crisalad_jax.utils.output import one_line, warn
 from crisalad_jax.utils.pytree import named_leaves
 
 VOCABULARY = "anyloc-words"
-"""Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023), with only the words."""
+"""Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023): only cluster centres."""
 REFERENCE = "reference"
-"""Name of the format of this project's torch reference, which can hold any model."""
+"""Name of the format of this project's torch reference, for any model on DINOv2 or a CNN."""
 
 
 def _with_squares(state: State, config: ModelConfig) -> ModelConfig:
@@ -120,10 +120,10 @@ FORMATS: dict[str, Format] = {}
 
 
 def add_formats(facts: Mapping[str, Any], source: str) -> None:
-    """Register the chains, tables, backbones, heads and formats of parsed TOML: all, or none.
+    """Register the entries of parsed TOML (chains, tables, backbones, heads, formats): all or none.
 
     Raises:
-        InputError: naming `source`, the file, if a name is taken or `facts` cannot be read.
+        InputError: a name is taken, or `facts` is invalid; the message names the file, `source`.
     """
     known = {"chains": _CHAINS, "tables": TABLES, "backbones": _BACKBONES, "heads": HEADS}
     known["formats"] = FORMATS

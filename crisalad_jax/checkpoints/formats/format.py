@@ -19,11 +19,11 @@ class BackboneNames(NamedTuple):
     """How files name a backbone's parameters."""
 
     kinds: tuple[type[Backbone], ...]
-    """Classes of the backbones; empty if another file holds the backbone, which may be any."""
+    """Classes of the backbones; empty if the backbone, of any class, is in another file."""
     rows: Rows
-    """Table of names: the files' after `prefix`, this package's after `backbone.`."""
+    """Table of corresponding names; the files' omit `prefix`, this package's omit `backbone.`."""
     marks: tuple[str, ...]
-    """Names after `prefix` of which every file with such a backbone has at least one."""
+    """Names, without `prefix`; every file with such a backbone has at least one of them."""
     prefix: str = ""
 
 
@@ -32,11 +32,11 @@ class Head(NamedTuple):
 
     kind: type[Aggregator]
     rows: Rows
-    """Table of names: the files' after `prefix`, this package's after `aggregator.`."""
+    """Table of corresponding names; the files' omit `prefix`, this package's omit `aggregator.`."""
     sizes: Mapping[str, str]
-    """Where to read fields of the aggregator's configuration, as `Reader.read` takes it."""
+    """For each field of the aggregator's configuration to read, the argument of `Reader.read`."""
     mark: str | None
-    """A name after `prefix` that every file with such a head has; None without parameters."""
+    """A name, without `prefix`, in every file with such a head; None for a head without arrays."""
     prefix: str
 
     def infer(self, state: State) -> Aggregator:
@@ -94,7 +94,7 @@ class Format:
         }
 
     def check_parts(self, config: ModelConfig) -> None:
-        """Check that a model has exactly the family's parts.
+        """Check that a model has exactly the parts of this format's model family.
 
         Raises:
             InputError: a part differs.
@@ -130,11 +130,11 @@ class Format:
         return self.head
 
     def has_backbone(self, state: State) -> bool:
-        """Return whether `state`, a file's arrays by name, includes the family's backbone."""
+        """Return whether `state`, a file's arrays by name, includes this format's backbone."""
         return any(self.backbone.prefix + mark in state for mark in self.backbone.marks)
 
     def has_head(self, state: State) -> bool:
-        """Return whether `state` includes the family's head; True for one without parameters."""
+        """Return whether `state` has this format's head; True if that head has no parameters."""
         return self.head.mark is None or self.head.prefix + self.head.mark in state
 
     def infer(self, state: State) -> ModelConfig:

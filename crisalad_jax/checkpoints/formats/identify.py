@@ -37,7 +37,7 @@ def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
         (name of the format, configuration, arrays by name without the prefixes of wrappers).
 
     Raises:
-        InputError: naming `source`, the file, if the names fit no format or the sizes no model.
+        InputError: the names fit no format, or the sizes no model; the message names the file.
     """
     found: list[tuple[int, str, ModelConfig, str, State]] = []
     problems: list[str] = []
@@ -72,7 +72,7 @@ def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
 
 
 def renamed_to(state: State, names: Set[str]) -> State:
-    """Return a state's arrays, stripped of wrappers and prefixes so as to fit `names` best."""
+    """Return a state with wrappers and prefixes stripped from its names, to fit `names` best."""
     return min((inside for _, inside in _readings(state)), key=lambda x: len(names ^ x.keys()))
 
 

@@ -1,7 +1,7 @@
 """Tables that match arrays of this package ("ours") with those of public files ("theirs").
 
-Forms only permute values, so gradients convert like weights, and a round trip gives the same bits.
-The exception is the bias of attention keys: no output depends on it, and some forms drop it.
+A `Form` converts arrays by permuting values, so gradients convert like weights, and a round trip
+is exact, except for the bias of attention keys: no output depends on it, and some forms drop it.
 """
 
 import itertools
@@ -46,7 +46,7 @@ class Absent(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Arrays, or layers with a table of arrays, that correspond; "#" stands for 0, 1, 2, ..."""
+    """Corresponding arrays, or layers whose arrays are in a table; "#" stands for 0, 1, 2, ..."""
 
     ours: tuple[str, ...]
     theirs: tuple[str, ...]
@@ -181,7 +181,7 @@ ABSENT = {
 
 
 def read_tables(texts: Mapping[str, str], known: Mapping[str, Rows]) -> dict[str, Rows]:
-    """Parse tables by name, which may include `known` and earlier ones; return all tables."""
+    """Parse tables, each of which may include `known` and earlier ones; return all, by name."""
     bias = Row(("bias",), ("bias",), SAME)
     tables: dict[str, Rows] = {
         name: (Row(("weight",), ("weight",), form), bias) for name, form in _LAYERS.items()

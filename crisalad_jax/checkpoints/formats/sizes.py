@@ -45,7 +45,7 @@ class Reader(NamedTuple):
         """Return the size of an array's axis, or `default` if there is no such array.
 
         Raises:
-            InputError: there is neither; or the array has no such axis, or it is empty there.
+            InputError: there is neither the array nor a default, or the axis is absent or empty.
         """
         if default is not None and not self.has(name):
             return default

@@ -50,7 +50,7 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
     """Check that a model can be written in the format `name` and read back as the same model.
 
     Returns:
-        The configuration inferred from such a file; fields such as the image size may differ.
+        The configuration that reading such a file infers; its image size, for example, may differ.
 
     Raises:
         InputError: the format does not exist or cannot hold a part; or a setting that shapes do
@@ -106,7 +106,7 @@ def to_params(
     DINOv2's mask token, the batch counts of batch norms, DINOv3's rotary periods.
 
     Raises:
-        InputError: naming `source`, the file, and the first names missing, unknown or misshaped.
+        InputError: arrays are missing, unknown or misshaped; the message names them and `source`.
     """
     lines, blank = table(config, name), _blank(config)
     shapes = {name: array.shape for name, array in _theirs(blank, lines, config, None).items()}
@@ -138,7 +138,7 @@ def to_params(
 def to_state(
     params: Crisalad, config: ModelConfig, name: str, extras: State
 ) -> dict[str, np.ndarray]:
-    """Return arrays by public name, the inverse of `to_params`; missing extras are initial values.
+    """Return arrays by public name, the inverse of `to_params`; missing extras get initial values.
 
     Raises:
         InputError: the format cannot hold a part of this model.

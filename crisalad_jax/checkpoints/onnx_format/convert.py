@@ -23,7 +23,7 @@ def convert(graph: Graph, traced: Any, inputs: Sequence[Value]) -> list[Value]:
         inputs: the program's arguments in order; some may be constants.
 
     Returns:
-        The outputs. If one depends on an unsupported primitive, its `Value.missing` names that.
+        The outputs; `Value.missing` names the unsupported primitive that one depends on, if any.
     """
     return _run(graph, traced.jaxpr, [Value.of(each) for each in traced.consts], inputs)
 

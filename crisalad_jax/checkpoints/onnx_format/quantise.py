@@ -1,4 +1,4 @@
-"""Quantise a program's products with weights to int8, with onnxruntime's calibration."""
+"""Quantise matrix products and convolutions to int8, as onnxruntime calibrates them."""
 
 import logging
 import pathlib
@@ -24,7 +24,7 @@ class _Images(quantization.CalibrationDataReader):
 def quantise(
     program: pathlib.Path, images: np.ndarray, nodes: Sequence[str], *, per_channel: bool
 ) -> None:
-    """Quantise to int8, in place, some products of a program that takes images.
+    """Quantise some matrix products and convolutions of a program to int8, in place.
 
     Args:
         program: the file in float32, for any number of images; its weights are next to it, with

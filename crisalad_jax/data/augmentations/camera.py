@@ -15,7 +15,7 @@ _QUALITY = (12, 85)
 
 @AUGMENTATIONS.register("camera")
 class CameraAugmentConfig(LightAugmentConfig):
-    """The light augmentation with the effects of a cheap camera, which rendered images lack."""
+    """The augmentation "light" with the effects of a cheap camera, which rendered images lack."""
 
     perspective: Fraction = 0.04
     """Largest shift of an image's corner by a perspective warp, as a fraction of the side."""

@@ -14,7 +14,7 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 
 @AUGMENTATIONS.register("light")
 class LightAugmentConfig(Augmentation):
-    """A small warp and mild changes of light, for training from scratch on fixed cameras."""
+    """A small warp and mild light changes, for training from scratch on images of fixed cameras."""
 
     crop: Fraction = 0.1
     """Largest fraction of each side that a crop removes."""

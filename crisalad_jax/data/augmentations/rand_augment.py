@@ -32,9 +32,9 @@ class RandAugmentConfig(Augmentation):
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Apply some of `OPERATIONS`, drawn uniformly with replacement, with random signs.
+        """Apply operations drawn uniformly with replacement; `signed` ones get a random sign.
 
-        The result is that of torchvision's RandAugment on Pillow images, bilinear with black fill.
+        The result equals that of torchvision's RandAugment on Pillow images (bilinear, black fill).
         """
         names = list(OPERATIONS)
         for number in generator.integers(len(names), size=self.operations):

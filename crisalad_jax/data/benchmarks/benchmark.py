@@ -33,9 +33,9 @@ class Benchmark:
     rule: str
     """Description of the rule that makes a database image a positive."""
     database_positions: Float64[np.ndarray, "database axis"] | None = None
-    """UTM east and north in metres, or `metres.on_ellipsoid` if zones differ; None if unknown."""
+    """East and north (or x and y) in metres, or points `metres.on_ellipsoid` if zones differ."""
     query_positions: Float64[np.ndarray, "q axis"] | None = None
-    """The same for the queries. Both are None for placeholder coordinates."""
+    """The same for the queries. Both are None if unknown, or for placeholder coordinates."""
     radius: float = 25.0
     """Distance in metres up to which two positions count as the same place."""
 

@@ -31,9 +31,9 @@ def read_folders(
     """Read an evaluation set from `database/` and `queries/`, whose images may have any names.
 
     The ground truth comes from `ground_truth.csv` next to the two folders, from `frames`, or from
-    positions; without these there is none. `ground_truth.csv` has lines `query,database`, with
-    paths relative to the two folders: one line for each match of a query, or the line `query,` for
-    a query without a match. Every query has a line.
+    positions; otherwise the set has none. `ground_truth.csv` has lines `query,database`, with paths
+    relative to the two folders: one line for each match of a query, or the line `query,` for a
+    query without a match. Every query has a line.
 
     Positions are in `positions.csv`, which names images by their path, such as `database/1.jpg`; or
     in `database.csv` and `queries.csv`, which name them by their path in these folders. The columns
@@ -50,10 +50,10 @@ def read_folders(
             so that frame 10 follows frame 9.
 
     Raises:
-        InputError: a folder is missing or without images; a table is not valid, names an image that
-            does not exist, leaves one out, or contradicts itself; two of `ground_truth.csv`,
-            `frames` and `radius` are given; `frames` is negative, or the folders then differ in
-            their number of images; a radius without positions; or only one side has positions.
+        InputError: a folder is missing or has no images; a table is not valid or omits an image;
+            `ground_truth.csv` names a missing image or contradicts itself; two of this file,
+            `frames` and `radius` are given; `frames` is negative, or given for folders of different
+            sizes; `radius` is given without positions; or one folder lacks positions.
     """
     root = pathlib.Path(root)
     folder, name = find_split(root, split)

@@ -53,12 +53,12 @@ def read_msls(
 ) -> Benchmark:
     """Read MSLS as published: all images except panoramas.
 
-    A query without a match counts as a miss. VPR-datasets-downloader uses the same images: about
-    11,000 queries of val.
+    A query without a match counts as a miss. VPR-datasets-downloader uses the same images; val has
+    about 11,000 queries.
 
     With `subtask`, the set is that of the official code, which has 740 queries in val: images that
     `subtask_index.csv` marks as `all`, and only queries with a database image within `radius`. A
-    query that then has no match because of `max_heading_difference` stays, and counts as a miss.
+    query that then loses all matches to `max_heading_difference` stays, and counts as a miss.
 
     Args:
         root: the folder with `train_val/`, or `train_val/` itself.
@@ -70,9 +70,9 @@ def read_msls(
         on_bad_image: "stop" refuses missing images; under "skip" `evaluate` leaves them out.
 
     Raises:
-        InputError: no such split, or none of its cities; a table that is missing, lacks a column or
-            differs from the others in its rows; a field that is not a number; missing images; no
-            query to evaluate; a negative radius; or an angle that is not from 0 to 180.
+        InputError: there is no such split, or none of its cities; a table is missing, lacks a
+            column or has other rows than `raw.csv`; a field is not a number; images are missing; no
+            query is left; `radius` is negative; or `max_heading_difference` is not from 0 to 180.
     """
     root, limit = pathlib.Path(root), max_heading_difference
     if limit is not None and not 0 <= limit <= 180:
@@ -162,7 +162,7 @@ def read_side(
     subtask: bool = False,
     clusters: bool = False,
 ) -> _Side:
-    """Read the database or the queries of a city without panoramas, in the order of the tables."""
+    """Read a city's database or queries, except panoramas, in the order of the tables."""
     columns = ("lat", "lon", *["ca"] * headings)
     raw = list(read_table(folder / "raw.csv", "key", "pano", *columns).rows())
     needed = ("key", "easting", "northing", *["unique_cluster"] * clusters)

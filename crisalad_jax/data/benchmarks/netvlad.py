@@ -41,8 +41,8 @@ def read_netvlad(
         on_bad_image: "stop" refuses missing images; under "skip" `evaluate` leaves them out.
 
     Raises:
-        InputError: no such file, no dbStruct in it, counts that differ from its arrays, missing
-            images, or a negative radius.
+        InputError: the file is missing or has no dbStruct, its counts differ from its arrays,
+            images are missing, or the radius is negative.
     """
     path = pathlib.Path(path)
     expected, damaged = "a .mat file with dbStruct", "cannot be read as a .mat file"

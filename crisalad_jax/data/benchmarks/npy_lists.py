@@ -99,14 +99,14 @@ def read_salad_lists(
 
     Args:
         root: a folder with such lists, or one of the files.
-        split: part of a set's name between underscores, such as `val`, if the folder has several.
+        split: part of a set's name between underscores, such as `val`, to choose one of several.
         images: the folder to which the names are relative; None tries the folder of the files, then
             its parent.
         on_bad_image: "stop" refuses missing images; under "skip" `evaluate` leaves them out.
 
     Raises:
-        InputError: not the lists of exactly one set, a file that holds anything but names or
-            indices, counts that disagree, an index that is out of range, or missing images.
+        InputError: `root` and `split` do not select exactly one set; a file holds anything but
+            names or indices; counts disagree; an index is out of range; or images are missing.
     """
     root = pathlib.Path(root)
     prefix, files = _choose(root, split)
@@ -141,7 +141,7 @@ def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
     """Find the lists of each set in a folder, or of the set that a file belongs to.
 
     Returns:
-        For each set with database and queries, by its files' prefix: the files by kind ("gt", ...).
+        The files of each set with database and queries, by their prefix, then by kind ("gt", ...).
     """
     one = _FILE.fullmatch(root.name) if root.is_file() else None
     sets: dict[str, _Lists] = collections.defaultdict(dict)

@@ -88,7 +88,7 @@ def find_images(
     on_bad_image: OnBadImage,
     folders: Sequence[str] = (".",),
 ) -> tuple[pathlib.Path, ...]:
-    """Return the paths of the images that a file names, in its order; `tables.Disk` finds them.
+    """Return the paths of the images that a file names, in its order, as spelled on disk.
 
     Args:
         named_by: the file, such as a list or a table.
@@ -99,7 +99,7 @@ def find_images(
             images is used.
 
     Raises:
-        InputError: images are missing, under "skip" all; the message names the first.
+        InputError: images are missing (under "skip": all of them); the message names the first.
     """
     near = (named_by.parent, named_by.parent.absolute().parent)
     tops = near if images is None else (pathlib.Path(images),)

@@ -71,8 +71,8 @@ def open_benchmark(
         The set: queries, database, positions and ground truth.
 
     Raises:
-        InputError: no known layout, an option that the layout does not have, or a set that its
-            reader refuses, for example because files are missing.
+        InputError: the layout is unknown, or does not take a given option; or its reader refuses
+            the set, for example because files are missing.
 
     Example:
         >>> import shutil

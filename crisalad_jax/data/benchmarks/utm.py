@@ -47,25 +47,25 @@ def read_utm(
     """Read images named `@UTM_east@UTM_north@zone@letter@...`; positives are within `radius`.
 
     Distances between images of one UTM zone and hemisphere are those in the zone's plane; other
-    distances are on the ground.
+    distances are those on the ground.
 
     VPR-datasets-downloader writes placeholder coordinates for Nordland (easting 0, frames
     a few metres apart), SPED and AmsterTime (easting 0, places 1 km apart). The name and the rule
-    of the result then say what they stand for. MSLS is recognised by the notes in the file names.
+    of the result then say what these stand for. MSLS is recognised by the notes in the file names.
 
     Args:
         root: a folder with `images/{test,val,train}`, or one that itself holds `database/` and
             `queries/`; SVOX's database is in `gallery/`.
         split: the folder in `images/`; None takes `test` or, if there is no `test`, `val`.
         radius: radius of positives in metres, inclusive.
-        queries: name of the folder of the queries: SVOX has `queries`, `queries_night` and others.
-            The name of the result includes it, unless it is `queries`.
+        queries: name of the folder of the queries, which must begin with `queries`, as SVOX's
+            `queries_night` does. The name of the result includes it, unless it is `queries`.
         ignore_zones: whether to compare coordinates of all zones as if in one plane, as the public
             tools do. The name of the result then says so.
 
     Raises:
-        InputError: no such split or folder, a folder without images, a name without coordinates, a
-            name without a zone in a set of several zones, or a negative radius.
+        InputError: the split or a folder is missing or has no images; a name lacks coordinates or,
+            in a set of several zones, a zone; `queries` begins otherwise; or `radius` is negative.
     """
     root = pathlib.Path(root)
     if not queries.startswith(QUERIES):

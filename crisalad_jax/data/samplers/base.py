@@ -34,9 +34,9 @@ class Draw(NamedTuple):
     generator: np.random.Generator
     """Random generator, the same for the same seed and epoch."""
     described: Int[np.ndarray, " n"]
-    """Indices of the images of `Sampler.images_to_describe`; none if `describes` is False."""
+    """Image indices that `Sampler.images_to_describe` returned; empty if `describes` is False."""
     descriptors: Float[np.ndarray, "n descriptor"]
-    """Descriptors of these images by the current model; NaN for images that cannot be read."""
+    """The current model's descriptors of these images; NaN for images that cannot be read."""
 
 
 class Sampler(Part, abc.ABC):
@@ -59,7 +59,7 @@ class Sampler(Part, abc.ABC):
     """Whether the sampler uses descriptors, which the model computes when an epoch begins."""
     regroups: ClassVar[bool] = False
     """Whether the sampler makes groups of images that serve as places: a group may mix images of
-    several of the set's places, also of places with few images."""
+    several of the set's places, and use places with few images."""
 
     def check(self, places: Places) -> None:
         """Raise InputError if the sampler cannot draw from these places; by default never."""

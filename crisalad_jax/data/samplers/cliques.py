@@ -1,8 +1,8 @@
 """CliqueMining, and SAGE's version: groups of images close together, from similar places.
 
 Written from the paper (Izquierdo and Civera, "Close, But Not There: Boosting Geographic Distance
-Sensitivity in Visual Place Recognition", ECCV 2024). There an earlier model describes the clusters
-once; here the model being trained describes them when an epoch begins.
+Sensitivity in Visual Place Recognition", ECCV 2024). In the paper, an earlier model describes the
+clusters once; here, the model being trained does so when an epoch begins.
 """
 
 import collections
@@ -114,8 +114,8 @@ class GeoVisual(Cliques):
     """
 
     anchors: PositiveInt = 16
-    """Number of random candidates for the first place, which is that of the highest affinity: its
-    summed similarity to the `similar` most similar places of its city."""
+    """Number of random candidates for the first place. The candidate with the largest affinity, a
+    sum of similarities to the `similar` most similar places of its city, is taken."""
 
     def _first(self, among: Int[np.ndarray, " place"], places: Places, draw: Draw) -> int:
         drawn = draw.generator.choice(among, min(self.anchors, len(among)), replace=False)

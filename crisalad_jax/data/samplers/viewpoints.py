@@ -29,7 +29,7 @@ class Viewpoints(Sampler):
     side: Literal["lateral", "frontal"] = "lateral"
     """Where the point is: "lateral" is across the street, "frontal" along it."""
     cell: PositiveFloat = 15.0
-    """Side of a cell in metres; its images make at most one class of each side."""
+    """Width of a square cell in metres; its images make at most one class of each `side`."""
     spacing: PositiveInt = 3
     """Smallest distance in cells between the cells of two classes in a batch."""
     focal_distance: PositiveFloat = 10.0

@@ -25,7 +25,7 @@ class CheckedPart:
     """A part of a folder: a split, or a folder of queries."""
 
     name: str
-    """Name of the part according to `open_benchmark`; if it cannot be opened, its location."""
+    """Name of the part from `open_benchmark`, or its location if it cannot be opened."""
     database: int | None = None
     """Number of database or training images."""
     queries: int | None = None

@@ -41,9 +41,9 @@ def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> 
         The path of the folder.
 
     Raises:
-        InputError: no such set, or one that has to be requested from a person; the network is
-            forbidden; the disk lacks space; a download fails or an archive is damaged; or the files
-            are not those of the set.
+        InputError: there is no such set, or only a person can get it; `to` is not empty; the
+            network is forbidden; the disk lacks space; a download fails or an archive is damaged;
+            or the files are not those of the set.
         ModuleNotFoundError: the set is on Hugging Face or Kaggle, and the extra `data` is missing.
 
     Example:

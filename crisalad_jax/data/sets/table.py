@@ -26,9 +26,9 @@ class SetFile:
     sha256: str | None = None
     """SHA-256 of the file; None if not published."""
     into: str = ""
-    """Path below the set's files where it is unpacked or, if it is not an archive, copied."""
+    """Path below the set's files to which the file is unpacked or, if not an archive, copied."""
     inside: str = ""
-    """Name of an archive in the file that holds the images; "" if there is none."""
+    """Name of an inner archive that holds the images; "" if there is none."""
 
     @property
     def name(self) -> str:
@@ -46,7 +46,7 @@ class SetPart:
     queries: int | None = None
     printed: str = ""
     """Regular expression for the beginning of the name that `open_benchmark` gives the part; for
-    parts whose counts other sets have too, or are unknown."""
+    parts whose counts are unknown, or the same as in other sets."""
 
     @property
     def words(self) -> str:
@@ -64,7 +64,7 @@ class PublishedSet:
     title: str
     host: Host
     page: str
-    """Address of the page that publishes it."""
+    """Address of the page that publishes the set."""
     command: str
     """Command that reads the set from a folder DIR."""
     sources: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Costs of models: speed, timed in turns under the same load; and of adapters (paper, Table 3)."""
+"""Costs of models (speed, timed in turns under the same load) and of adapters (paper, Table 3)."""
 
 import dataclasses
 import functools
@@ -47,10 +47,10 @@ def race(
 ) -> dict[str, list[float]]:
     """Time functions in turns, so that all of them run under the same load.
 
-    A contender makes the function to time, which must finish its work before it returns. It makes
-    one for each turn, so that only one model is in memory at a time. Its very first call, which
-    compiles, does not count, nor does the first call of a turn; if that took three seconds or more,
-    one more call is timed, otherwise three. A progress bar counts the turns, unless `quiet`.
+    A contender makes the function to time, a new one for each turn, so that only one model is in
+    memory at a time. The function must finish its work before it returns. The first call of a turn
+    is not counted; if it took three seconds or more, one more call is timed, otherwise three. An
+    extra turn per contender comes first, to compile. A progress bar counts turns, unless `quiet`.
 
     Returns:
         Seconds per call, by name: for each of the `rounds`, the median of its calls.
@@ -71,7 +71,7 @@ def race(
 
 
 def ratios(rounds: Mapping[str, Sequence[float]], name: str, than: str) -> list[float]:
-    """Divide the times of `name` by those of `than` in each round, when the load was the same."""
+    """Divide the times of `name` by those of `than` in each round of `race`: under equal load."""
     pairs = zip(rounds[name], rounds[than], strict=True)
     return [ours / theirs for ours, theirs in pairs]
 
@@ -103,10 +103,10 @@ class AdapterCost(NamedTuple):
     macs: int
     """Multiply-accumulates that the adapter really adds to a block, per image."""
     time: Spread | None
-    """Time of the gradient of a block, divided by that without adapter; None if not measured."""
+    """Time of a block's gradient, divided by the time without adapter; None if not measured."""
     memory: float | None
-    """Memory for that gradient by the compiler's count, divided by that without adapter; None if
-    not measured."""
+    """Memory for that gradient by the compiler's count, divided by the memory without adapter; None
+    if not measured."""
 
 
 _PAPER_PARAMETERS: Mapping[str, int] = {
@@ -136,7 +136,7 @@ def adapter_memory(names: Iterable[str]) -> dict[str, int]:
 def adapter_costs(
     seconds: Mapping[str, Sequence[float]], memory: Mapping[str, int]
 ) -> list[AdapterCost]:
-    """Compute the paper's Table 3: the costs of one adapter in ViT-B/14, for all adapters here.
+    """Compute the paper's Table 3, the costs of an adapter in ViT-B/14, for every adapter here.
 
     Args:
         seconds: what `race` returns for `adapter_calls`; empty if nothing was measured.

@@ -103,7 +103,7 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
 def is_method(name: str) -> bool:
     """Return whether a name is that of a method or recipe, or looks like RECIPE+PART or KIND:NAME.
 
-    The name of a part alone does not count, since with weights it may be the name of any model.
+    Parts alone and recipes that mine tuples or mix sets do not count: weights may have their names.
 
     Example:
         >>> is_method("salad"), is_method("crisalad+gem"), is_method("megaloc")
@@ -138,7 +138,7 @@ def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfi
         The training configuration, with its model.
 
     Raises:
-        InputError: no such preset, recipe or part, or one that does not fit the preset.
+        InputError: the preset, recipe or part does not exist, or the part does not fit the preset.
 
     Example:
         >>> method_training("crisalad+light", "b14", from_nothing=True).augmentation
@@ -177,7 +177,7 @@ class Ablation(NamedTuple):
         return dataclasses.replace(config, optimiser=optimiser)
 
     def words(self, training: TrainConfig) -> str:
-        """Describe what a row changes or, for CriSALAD, all settings; `training` is its recipe."""
+        """List the settings that the row changes (all if none); `training` is the row's recipe."""
         words = (
             f"adapter {self.adapter}",
             f"cross-image encoder {'yes' if self.encoder else 'no'}",
@@ -236,7 +236,7 @@ class AblationRow(NamedTuple):
         """Return the training configuration: the recipe with the row's flags applied.
 
         Raises:
-            InputError: no such recipe, flag or part, or a value that does not fit.
+            InputError: the recipe, a flag or a part does not exist, or a value does not fit.
         """
         found = method_of(self.recipe, preset, f"--row {self.name}: recipe").recipe
         return self.changed(method_training(found, preset, from_nothing=from_nothing), preset)

@@ -71,7 +71,7 @@ class ComparisonConfig:
     """Path of the training set, in any layout that `read_places` reads."""
     weights: tuple[str, ...] = ()
     """Weights of what is not trained here: NAME=FILE, or NAME of a published model. A NAME that is
-    not a method has its own row, whatever its model; + adds a second stage, as in fol-large+fol."""
+    not a method has its own row, with any model; + adds a second stage, as in fol-large+fol."""
     backbone: str | None = None
     """File of the backbone that training starts from; None is random weights, as in `scratch`."""
     preset: str = "b14"
@@ -111,7 +111,7 @@ class ComparisonConfig:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Names of all that is compared: `names`, then those of the custom rows."""
+        """Names of everything compared: `names`, then those of the custom rows."""
         return (*self.names, *(parse_row(text).name for text in self.rows))
 
     @property
@@ -191,11 +191,11 @@ class Variant:
     run: str
     """Name of the run that makes its model; other variants may share the run."""
     training: TrainConfig
-    """Configuration of its training with seed 0; for a model from a file, only `model` is used."""
+    """Configuration of the training with seed 0; for a model from a file, only `model` is used."""
     rerank: str | None = None
     """Second stage, as `--rerank` of `evaluate` reads it."""
     row: AblationRow | None = None
-    """The custom row that it stands for, if any."""
+    """The custom row that the variant stands for, if any."""
     weights: pathlib.Path | None = None
     """File of the model, if it comes from one."""
     places: Places | None = None
@@ -213,7 +213,7 @@ class Variant:
 
     @property
     def trains(self) -> bool:
-        """Whether its model is trained here: not read from a file, and more than a vocabulary."""
+        """Whether the model is trained here: it is neither from a file nor just a vocabulary."""
         return self.weights is None and self.model.aggregator.trainable
 
 

@@ -55,7 +55,7 @@ class RunResult:
     training: dict[str, Any] | None = None
     """Steps and times of its training; None until it is finished."""
     ranks: dict[str, dict[str, list[int]]] = dataclasses.field(default_factory=dict)
-    """Rank (1 is best, 0 none) of each query's first correct answer, by evaluation and grouping."""
+    """Rank from 1 of each query's first correct answer, or 0; by `Evaluation.key` and grouping."""
 
     def write(self, folder: pathlib.Path) -> None:
         """Write the results atomically to `result.json` in the run's folder."""
@@ -66,7 +66,7 @@ class Evaluation(NamedTuple):
     """An evaluation of a run: for one of its variants, on one benchmark."""
 
     key: str
-    """Text with all that its result depends on, except the model: second stage, set, grouping."""
+    """Text of what the result depends on besides the model: second stage, set and grouping."""
     variant: Variant
     benchmark: Benchmark
 
@@ -110,7 +110,7 @@ class Run(NamedTuple):
 
 
 def runs_of(prepared: Prepared, out: pathlib.Path) -> list[Run]:
-    """List a comparison's runs in `out`: each model with all seeds, or one if from a file."""
+    """List a comparison's runs in `out`: one per model and seed, or one for a model from a file."""
     config = prepared.config
     how = f"{config.grouping}, batches of {config.batch_size}"
     evaluations: dict[str, list[Evaluation]] = {}
@@ -170,7 +170,7 @@ class Row(NamedTuple):
     """Number of parameters that were trained; None for a model from a file."""
     training: Spread | None
     """Training time divided by the reference's, for each pair of runs with a device to themselves;
-    None if either has fewer than two such runs."""
+    None if the method or the reference has fewer than two such runs."""
     training_seconds: Spread | None
     """Steps times the median seconds of a step, for such runs; None for fewer than two of them."""
 
@@ -197,8 +197,8 @@ def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any])
     Args:
         prepared: the comparison.
         runs: its runs, all of them done.
-        speed: contents of speed.json: times of the models ("rounds") and "adapters", "device",
-            "batch_size", "adapter_memory", and whether the times are "absolute".
+        speed: contents of speed.json: times of models ("rounds") and "adapters", "adapter_memory",
+            "device", "batch_size", and "absolute" (False on a CPU, where other load changes times).
 
     Returns:
         The summary.
@@ -288,9 +288,9 @@ def _ranks(
 
 
 def recall_of(ranks: np.ndarray, k: int, reference: np.ndarray | None = None) -> Recall:
-    """Compute Recall@K from (seed, query) ranks of the first correct retrieval, from 1; 0 is none.
+    """Compute Recall@K from (seed, query) ranks of first correct retrievals: from 1, or 0 if none.
 
-    Seeds are paired with those of the reference if both have as many: all trainings share them.
+    Seeds are paired with those of `reference` if their numbers agree: all trainings share seeds.
     """
     hits = (ranks > 0) & (ranks <= k)
     by_seed = tuple(hits.mean(axis=1).tolist())

@@ -71,7 +71,7 @@ def compare(
 ) -> Summary:
     """Train or load the methods of a comparison, evaluate them the same way, and write the tables.
 
-    As much as possible is checked before any work. The same call resumes after a kill. Methods,
+    As much as possible is checked first. The same call resumes a killed comparison. Methods,
     rows, seeds and sets may be added or left out between calls: runs that `out` already holds are
     not repeated.
 

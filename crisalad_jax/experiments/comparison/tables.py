@@ -135,7 +135,7 @@ def _ratios(times: Sequence[float]) -> str:
 
 
 def adapter_cells(cost: AdapterCost) -> dict[str, str]:
-    """Format the costs of an adapter as cells, by header; "-" is what the paper or run lacks."""
+    """Format the costs of an adapter as cells, by header; "-" where the paper or run has none."""
     paper = parameters = flops = NOTHING
     if cost.paper_macs is not None:
         paper, flops = (f"{count * cost.paper_macs / 1e6:.3f}" for count in (1, 2))
@@ -155,7 +155,7 @@ def adapter_cells(cost: AdapterCost) -> dict[str, str]:
 
 
 def as_json(summary: Summary) -> dict[str, Any]:
-    """Convert a summary to JSON values; recalls are fractions, and sets are names."""
+    """Convert a summary to JSON values; recalls are fractions, and sets become their names."""
     names = {name: each.name for name, each in summary.sets.items()}
     return _plain(summary) | {"sets": names}
 

@@ -52,7 +52,7 @@ def share_of(nodes: Sequence[Mapping[str, float]], jobs: int | None) -> Share:
 
     Args:
         nodes: the resources of each node, by Ray's names for them, "CPU" and "GPU".
-        jobs: tasks at a time. None is one per GPU, or one per node if there are no GPUs.
+        jobs: number of tasks at a time. None is one per GPU, or one per node if there are no GPUs.
 
     Returns:
         The share of each task.
@@ -95,7 +95,7 @@ def joined(
         write: a folder that every node must be able to write into.
 
     Raises:
-        InputError: no such cluster; a node cannot take part; or no share becomes free in time.
+        InputError: there is no such cluster, a node cannot take part, or no share becomes free.
     """
     names = filter(None, (*read, *loaded_plugins()))
     paths = [os.path.abspath(name) for name in names if os.path.exists(name)]

@@ -53,7 +53,7 @@ def recall_curves(
     """Draw Recall@K in percent against K, one named line per curve.
 
     Args:
-        curves: fractions of the queries, 0 to 1, by name and K.
+        curves: fractions of the queries, 0 to 1, by name, then by K.
         title: title above the picture.
         wide: whether the figure stands alone, rather than in a page that is also read on phones.
 
@@ -86,7 +86,7 @@ def precision_curves(curves: Mapping[str, PrecisionRecall]) -> Picture:
 def training_curves(records: Sequence[Mapping[str, int | float]]) -> Picture:
     """Draw the loss, learning rate and validation recalls of a training run against its steps.
 
-    Each series has a panel; recalls share one. Long noisy series are pale, below a running mean.
+    Each series has a panel; recalls share one. A long noisy series is pale, under a running mean.
 
     Args:
         records: the lines of metrics.jsonl (`read_metrics`), each with "step" and any of "loss",
@@ -174,8 +174,8 @@ def find_placed(
     """Separate images with a plausible position in metres from those with a placeholder.
 
     A position is implausible if it is over a kilometre from the median position, and over ten times
-    as far as the nearest nine tenths of the images. Neither limit counts images at (0, 0), or at a
-    position shared with many others. A second city with a tenth of the images is plausible.
+    as far as the nearest nine tenths of the images. Images at (0, 0), or at a position shared with
+    many others, count for neither limit. A second city with a tenth of the images is plausible.
     """
     points = np.concatenate([database, queries])
     _, which, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)

@@ -74,8 +74,8 @@ def show_retrievals(
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: `found` of another class; a result without its benchmark, or answers with one;
-            no query, or an index out of range; or an image that cannot be read.
+        InputError: `found` is of another class; a result has no benchmark, or answers have one; no
+            query is chosen, or an index is out of range; or an image cannot be read.
 
     Example:
         >>> import numpy as np, pathlib

@@ -64,8 +64,8 @@ def show_attention(
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: no such block, head or patch; a backbone without attention maps; or an image
-            that cannot be read or described.
+        InputError: there is no such block, head or patch; the backbone has no attention maps; or
+            the image cannot be read or described.
 
     Example:
         >>> import jax
@@ -138,8 +138,8 @@ def show_image_attention(
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: no images, or several sizes if the model does not resize; no cross-image encoder
-            with attention; a mask of another shape; or an image that cannot be read or described.
+        InputError: there are no images, or their sizes differ and the model does not resize; its
+            encoder has no attention; `mask` does not fit; or an image cannot be read or described.
 
     Example:
         >>> import jax
@@ -264,7 +264,7 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
         A figure for notebooks; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
-        InputError: descriptors on a line or not finite, or over 36 places, or not one for each.
+        InputError: descriptors are on a line or not finite; `places` do not fit, or are over 36.
 
     Example:
         >>> import numpy as np

@@ -71,8 +71,8 @@ def write_report(
         The path of the page.
 
     Raises:
-        InputError: no ground truth, an image that cannot be read, or files that cannot be written
-            (none is then written).
+        InputError: there is no ground truth, an image cannot be read, or a file cannot be written;
+            no file is then written.
 
     Example:
         >>> import shutil

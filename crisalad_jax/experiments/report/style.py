@@ -169,7 +169,7 @@ def chart(figure: Picture, path: pathlib.Path, alt: str) -> Drawing:
 
 
 def illustration(figure: Picture, alt: str) -> Drawing:
-    """Return a figure that shows photographs for a page, as a WebP."""
+    """Convert a figure with photographs to a WebP image for a page."""
     data = _encode(figure, "webp", pil_kwargs={"quality": _WEBP_QUALITY})
     return _embed(figure, "webp", data, alt)
 
@@ -181,7 +181,7 @@ def _embed(figure: Figure, kind: str, data: bytes, alt: str) -> Drawing:
 def photograph(
     image: UInt8[np.ndarray, "h w 3"], alt: str, kind: str = "", lines: tuple[str, ...] = ()
 ) -> Drawing:
-    """Return RGB pixels for a page, as a WebP of a few kilobytes."""
+    """Convert RGB pixels to a WebP image of a few kilobytes for a page."""
     _, data = cv2.imencode(".webp", image[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])
     height, width = image.shape[:2]
     return Drawing(_uri("webp", data.tobytes()), width, height, alt, kind, lines)

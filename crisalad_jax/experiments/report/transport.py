@@ -34,8 +34,8 @@ def show_transport(image: Image, model: Model) -> Picture:
     """Draw an image, the share of each patch in the dustbin, and the cluster that took most of it.
 
     The seven strongest clusters have colours; patches that went to others stay grey. A colour is
-    stronger the more mass all clusters took from the patch. A transport without a dustbin, which
-    takes patches that belong to no cluster, has no middle panel.
+    stronger the more mass all clusters took from the patch. The dustbin takes patches that belong
+    to no cluster; for a transport without it, there is no middle panel.
 
     Args:
         image: an image file, or an array that `prepare_image` takes.
@@ -106,9 +106,9 @@ def transport_of(image: Pixels, model: Model) -> Transported:
 def strongest_clusters(pictures: Sequence[Transported]) -> dict[int, float]:
     """Find up to seven clusters that take the most mass from the patches that they win.
 
-    A cluster wins a patch if it takes more mass from it than any other cluster. The result maps its
-    index to its mass from these patches as a share of the mass of all clusters, largest first.
-    (From all patches of an image every cluster takes the same mass, which would not rank them.)
+    A cluster wins a patch if it takes more mass from it than any other cluster. The result maps the
+    index of each cluster to its mass from these patches, as a share of the mass of all clusters,
+    largest first. (The mass from all patches is the same for each cluster, so it cannot rank them.)
     """
     mass = np.zeros(pictures[0].clusters)
     for picture in pictures:

@@ -150,7 +150,7 @@ class Adapter(Part, abc.ABC):
     def side_path(
         self, params: Any, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, Any]:
-        """Return a side path's tokens after a block; the last block's are the backbone's output.
+        """Return a path's tokens after a block; after the last one, they are the backbone's output.
 
         The path starts from the tokens that enter the first block with an adapter.
 

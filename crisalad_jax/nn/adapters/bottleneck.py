@@ -70,7 +70,7 @@ class MlpAdapter:
 
 @pytree_dataclass
 class SerialParallelAdapter:
-    """SelaVPR's MLPs (Lu et al. 2024): after the attention, with a skip; parallel to the MLP."""
+    """SelaVPR's MLPs (Lu et al. 2024): after the attention (with a skip), parallel to the MLP."""
 
     serial: MlpAdapter
     parallel: MlpAdapter
@@ -117,7 +117,7 @@ class DepthwiseConfig(BottleneckAdapter):
     """The paper's depthwise-separable convolution, parallel to the MLP (section 3.2)."""
 
     kernel_size: PositiveInt = 3
-    """Side of the depthwise filter."""
+    """Side of the depthwise filter in patches, an odd number."""
     bias: Literal["convolutions", "up"] = "convolutions"
     """Layers that have biases: the two convolutions, or the up-projection. The paper gives only the
     number of parameters (Table 3), which is 741,504 in either case."""
@@ -166,7 +166,7 @@ class MultiResolutionConfig(BottleneckAdapter):
 
 @ADAPTERS.register("mlp")
 class MlpConfig(BottleneckAdapter):
-    """A plain MLP with ReLU, parallel to the block's (AdaptFormer: Chen et al., NeurIPS 2022)."""
+    """A ReLU MLP, parallel to the block's MLP (AdaptFormer: Chen et al., NeurIPS 2022)."""
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> MlpAdapter:
         """Draw the down-projection as torch does, and set the up-projection to 0."""

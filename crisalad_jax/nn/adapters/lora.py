@@ -24,9 +24,9 @@ class LowRank:
 
 @ADAPTERS.register("lora")
 class LoraConfig(Adapter):
-    """Low-rank updates of linear layers, W x + alpha / rank B A x (LoRA: Hu et al. 2021).
+    """Low-rank updates of linear layers, W x + (alpha / rank) B A x (LoRA: Hu et al. 2021).
 
-    There is no dropout. `merge_adapters` adds alpha / rank B A to W for inference.
+    There is no dropout. `merge_adapters` adds (alpha / rank) B A to W for inference.
     """
 
     rank: PositiveInt = 8
@@ -55,14 +55,14 @@ class LoraConfig(Adapter):
     def linear_update(
         self, params: dict[str, LowRank], name: str, x: Float[Array, "*batch d_in"]
     ) -> Float[Array, "*batch d_out"] | None:
-        """Return alpha / rank B A x, or None for other layers; no array has the size of B A."""
+        """Return (alpha / rank) B A x without forming B A; None for a layer without an update."""
         if name not in params:
             return None
         hidden = keep(linear(params[name].down, x), "down")
         return self.alpha / self.rank * linear(params[name].up, hidden)
 
     def merge(self, params: dict[str, LowRank], name: str, layer: Linear) -> Linear:
-        """Return the layer with alpha / rank B A added to its weight."""
+        """Return the layer with (alpha / rank) B A added to its weight."""
         if name not in params:
             return layer
         product = jnp.matmul(params[name].down.weight, params[name].up.weight, precision="highest")

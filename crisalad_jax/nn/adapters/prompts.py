@@ -22,7 +22,7 @@ class PromptsConfig(Adapter):
     """Prompts in every block (VPT-deep: Jia et al., ECCV 2022), without dropout.
 
     The tokens of an image attend to a block's prompts, whose outputs are dropped. Each prompt adds
-    a token to the attention. Unlike other adapters, untrained prompts change the descriptors.
+    a token to the attention. Unlike most adapters, untrained prompts change the descriptors.
     """
 
     count: PositiveInt = 10

@@ -115,7 +115,7 @@ class Aggregator(Part, abc.ABC):
             params: from `init`.
             features: the features that `features` requested.
             grid: rows and columns of patches.
-            key: random key for dropout, one for all images or for each; None for inference.
+            key: random key for dropout, one for all images or one for each; None for inference.
         """
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
@@ -124,7 +124,7 @@ class Aggregator(Part, abc.ABC):
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Any:
         """Make parameters from k-means centroids of features.
 
-        Aggregators that implement this have `starts_from_centroids`.
+        `starts_from_centroids` is True for aggregators that implement this.
 
         Args:
             centroids: k-means centroids of what `centroid_features` returns.
@@ -142,7 +142,7 @@ class Aggregator(Part, abc.ABC):
         return params
 
     def centroid_features(self, features: FeatureRows) -> Float[Array, "feature reduced"]:
-        """Return what k-means clusters, given unit features; by default these themselves."""
+        """Return what k-means clusters, given unit features; by default the features themselves."""
         return features
 
     def count_centroids(self, dim: int) -> int:
@@ -154,19 +154,19 @@ class Aggregator(Part, abc.ABC):
 
     @property
     def starts_from_centroids(self) -> bool:
-        """Whether it has a vocabulary (centroids) to build before the model is used or trained."""
+        """Whether a vocabulary (centroids) must be built before the model is used or trained."""
         return type(self).from_centroids is not Aggregator.from_centroids
 
     @property
     def transports(self) -> bool:
-        """Whether it implements `plan`."""
+        """Whether the aggregator implements `plan`."""
         return type(self).plan is not Aggregator.plan
 
     def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"]:
         """Return the mass that an optimal transport sends from each patch to each cluster.
 
         A patch sends a mass of 1. A dustbin, for patches without a cluster, is the last column.
-        Aggregators that implement this have `transports`; others raise InputError.
+        `transports` is True for aggregators that implement this; others raise InputError.
         """
         raise InputError(
             f"aggregator: found {self.part_name}, expected one that transports, such as salad"
@@ -195,10 +195,10 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
 
 
 def require_side(name: str, grid: Grid, regions: int, patch_size: int) -> None:
-    """Check that each side of a patch grid has at least as many patches as `regions`.
+    """Check that each side of a patch grid has at least `regions` patches.
 
     Raises:
-        InputError: a side has fewer; the message has pixels, and `name` as the aggregator.
+        InputError: a side has fewer; the message is in pixels, and calls the aggregator `name`.
     """
     side = regions * patch_size
     height, width = (patch_size * each for each in grid)

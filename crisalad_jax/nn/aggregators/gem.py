@@ -93,7 +93,7 @@ class CosPlaceConfig(Aggregator):
     """Width of the descriptor: 512 in CosPlace, 2,048 in EigenPlaces."""
 
     def token_shape(self, dim: int) -> TokenShape:
-        """Return the shape of a global token."""
+        """Return the shape of a global token of width `self.dim`."""
         return TokenShape(self.dim, 0, self.dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> CosPlace:
@@ -154,7 +154,7 @@ class ApGemConfig(CosPlaceConfig):
 
 
 def whiten(params: Whitening, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
-    """Project onto the components, each divided by variance^(1/4), as AP-GeM's public code does."""
+    """Project `x` onto the components, each divided by variance^(1/4), as AP-GeM's code does."""
     components = jnp.matmul(x - params.mean, params.components.T, precision="highest")
     return components * params.variance**-0.25
 

@@ -47,12 +47,12 @@ class PairLayer:
     norm3: LayerNorm
     mlp: TwoLayer
     norm_other: LayerNorm
-    """Layer norm of the second image's tokens, which no layer updates."""
+    """Layer norm of the second image's tokens; the decoder does not update these tokens."""
 
 
 @pytree_dataclass
 class PairVpr:
-    """Parameters of the layer that makes descriptors, and of the decoder, which scores pairs."""
+    """Parameters of the descriptor's layer (`reduction`) and of the decoder, which scores pairs."""
 
     cls_token: Float[Array, " width"]
     """Class token of the decoder; its output gives the logit of a pair."""
@@ -69,7 +69,7 @@ class PairVpr:
     "pair-vpr", tiny={"dim": 64, "width": 64, "layers": 2, "hidden": 32, "positions": 49}
 )
 class PairVprConfig(Aggregator):
-    """The descriptor of Pair-VPR, and its second stage's decoder (Hausler and Moghadam, RA-L 2025).
+    """Pair-VPR's descriptor, and the decoder that re-ranks (Hausler and Moghadam, RA-L 2025).
 
     Example:
         >>> from crisalad_jax import ModelConfig
@@ -87,7 +87,7 @@ class PairVprConfig(Aggregator):
     hidden: PositiveInt = 512
     """Hidden width of the network that computes the logit of a pair."""
     positions: PositiveInt = 529
-    """Number of position embeddings, a square: 529 are 23 x 23 patches of 322 x 322 pixels."""
+    """Number of position embeddings, a square: 529 is 23 x 23, for images of 322 x 322 pixels."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -138,12 +138,12 @@ class PairVprConfig(Aggregator):
     def logits(
         self, params: PairVpr, first: Patches, second: Patches, grid: Grid
     ) -> Float[Array, "*batch"]:
-        """Compute a logit for each ordered pair of images: the larger, the likelier the same place.
+        """Compute a logit for each ordered pair of images: how likely both show the same place.
 
         Args:
             params: from `init`.
             first: patches of the first image of each pair, from the backbone's last layer norm.
-            second: the same of the second images, to which `first` attends.
+            second: the same for the second images, to which the first images attend.
             grid: rows and columns of patches, the same for all images.
         """
         x, other = (self.with_positions(params, each, grid) for each in (first, second))
@@ -177,7 +177,7 @@ class PairVprConfig(Aggregator):
         x: Float[Array, "*batch token width"],
         other: Float[Array, "*batch patch width"],
     ) -> Float[Array, "*batch token width"]:
-        """Update the first images' tokens `x` by one decoder layer; `other` are the second's."""
+        """Apply one layer to the first images' tokens `x`; `other` are tokens of the second."""
         x = x + attention(layer.attn, _norm(layer.norm1, x), self.heads)
         memory = _norm(layer.norm_other, other)
         x = x + cross_attention(layer.cross_attn, _norm(layer.norm2, x), memory, self.heads)

@@ -82,7 +82,7 @@ class BoqConfig(Aggregator):
 
     @property
     def heads(self) -> int:
-        """Number of heads in every attention, one for every 64 channels, as in the public code."""
+        """Number of heads per attention layer, one for every 64 channels, as in the public code."""
         return max(1, self.channels // 64)
 
     def features(self, depth: int) -> FeatureSpec:
@@ -105,7 +105,7 @@ class BoqConfig(Aggregator):
         )
 
     def apply(self, params: Boq, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return `rows` local tokens of width `channels`, in float32 at least."""
+        """Return `rows` local tokens of width `channels`, in at least float32."""
         patches = features.patches
         maps = patches.reshape(-1, *grid, patches.shape[-1])
         maps = conv(params.proj_c, maps)
@@ -178,7 +178,7 @@ class EdtFormerConfig(Aggregator):
     queries: PositiveInt = 64
     """Number of learnt queries."""
     channels: PositiveInt = 256
-    """Number of channels of a query output after their linear projection."""
+    """Number of channels of a query output after a linear projection."""
     rows: PositiveInt = 16
     """Number of local tokens (rows) that a linear layer computes from all query outputs."""
 
@@ -214,7 +214,7 @@ class EdtFormerConfig(Aggregator):
         )
 
     def apply(self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return `rows` local tokens of width `channels`, in float32 at least."""
+        """Return `rows` local tokens of width `channels`, in at least float32."""
         answers = decode(params, features, self.heads)
         channels = linear(params.channel_proj, answers).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))

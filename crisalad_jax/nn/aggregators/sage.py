@@ -36,7 +36,7 @@ class Sage:
     cluster_features: TwoLayer
     score: TwoLayer
     power: TwoLayer
-    """Network from an image's mean cluster features to the exponent of `layers.powers`."""
+    """Network from each cluster's mean over its features to the exponent in `layers.powers`."""
 
 
 @AGGREGATORS.register(
@@ -46,8 +46,8 @@ class SageConfig(Aggregator):
     """SAGE's aggregation (ICLR 2026).
 
     Each cluster is a mean of the patches, weighted by a softmax of their scores, without a dustbin
-    or a transport. A signed power of each value is then added to it. This power is discontinuous at
-    0, so values near 0 are sensitive to rounding.
+    or a transport. Then the signed power of each value is added to the value itself. This power is
+    discontinuous at 0, so values near 0 are sensitive to rounding.
 
     Example:
         >>> from crisalad_jax import ModelConfig
@@ -82,7 +82,7 @@ class SageConfig(Aggregator):
         )
 
     def apply(self, params: Sage, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the global token and the clusters, each L2-normalised, in float32 at least."""
+        """Return the global token and the clusters, each L2-normalised, in at least float32."""
         patches = weighted(params.weighting, features.patches)
         means = pooled(params, patches)
         # An image has one exponent for all features of all clusters.

@@ -84,13 +84,13 @@ class SaladConfig(Aggregator):
     learn_epsilon: bool = False
     """Whether epsilon is learnt, with `epsilon` as initial value."""
     row_tau: float = 1.0
-    """How closely patches keep to their mass: exactly if 1; if below 1, a Kullback-Leibler penalty
-    of weight epsilon * tau / (1 - tau) pulls them to it. If `column_tau` is below 1 too, high
-    scores can make masses overflow."""
+    """How closely each patch keeps to its mass of 1: exactly if 1; if below 1, only through a
+    Kullback-Leibler penalty of weight epsilon * tau / (1 - tau). If `column_tau` is below 1 too,
+    high scores can make masses overflow."""
     column_tau: float = 1.0
     """The same as `row_tau`, for the masses of the clusters and the dustbin."""
     learn_tau: bool = False
-    """Whether `row_tau` and `column_tau`, where below 1, are learnt, through a sigmoid."""
+    """Whether `row_tau` and `column_tau` are learnt, through a sigmoid; a tau of 1 stays fixed."""
     sinkhorn: SinkhornConfig = SinkhornConfig()
     """Solver of the transport problem."""
 
@@ -105,11 +105,11 @@ class SaladConfig(Aggregator):
 
     @property
     def scores(self) -> int:
-        """Number of network scores of a patch: one for each cluster, and any for the dustbin."""
+        """Number of scores that the network gives a patch: one per cluster, and the dustbin's."""
         return self.clusters + self.dustbin.scores
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
-        """Raise InputError if the dustbin needs more patches than clusters, and there are not."""
+        """Raise InputError if the grid has fewer patches than clusters and dustbin need."""
         patches = math.prod(grid)
         height, width = (patch_size * side for side in grid)
         side = patch_size * (math.isqrt(self.clusters) + 1)
@@ -151,10 +151,10 @@ class SaladConfig(Aggregator):
         return params.dust_bin
 
     def transport(self, params: Any, features: Features, *, key: Keys) -> SinkhornResult:
-        """Assign patches to clusters and, last, the dustbin (SALAD's Eqs. 3 to 5), in float32.
+        """Solve the transport (SALAD's Eqs. 3 to 5), in at least float32; the dustbin comes last.
 
         Raises:
-            InputError: the dustbin needs more patches than clusters, and there are not.
+            InputError: the dustbin needs more patches than clusters, and there are too few.
         """
         patches, learnt = features.patches, params.log_epsilon
         scores = at_least_float32(two_layer(params.score, patches, self.dropout, key))
@@ -171,13 +171,13 @@ class SaladConfig(Aggregator):
         )
 
     def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Return the global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
+        """Return global and cluster tokens (paper Eq. 6), each L2-normalised, in at least float32.
 
-        The tokens include the transport's statistics, without gradients. A batch is faster than
-        `vmap`: for it, the transport chooses its domain once for all images.
+        The tokens include the transport's statistics, without gradients. Pass images as a batch:
+        under `vmap`, the transport would be computed in both its domains (scaling and log).
 
         Raises:
-            InputError: the dustbin needs more patches than clusters, and there are not.
+            InputError: the dustbin needs more patches than clusters, and there are too few.
         """
         cluster_key, score_key = split_key(key, 2)
         global_token = two_layer(params.token_features, features.class_token, 0.0, None)
@@ -189,7 +189,7 @@ class SaladConfig(Aggregator):
         return Tokens(l2_normalise(at_least_float32(global_token)), l2_normalise(sums), statistics)
 
     def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"]:
-        """Return the mass that each patch sends to each cluster and to the dustbin."""
+        """Return the mass that each patch sends to each cluster and, last, to the dustbin."""
         return jnp.exp(self.transport(params, features, key=None).log_plan)
 
 
@@ -226,7 +226,7 @@ class FolConfig(SaladConfig):
 
     @property
     def scores(self) -> int:
-        """Number of network scores of a patch: one per cluster. The dustbin's is from attention."""
+        """Number of scores from the network: one per cluster. Attention gives the dustbin's."""
         return self.clusters
 
     def features(self, depth: int) -> FeatureSpec:

@@ -77,7 +77,7 @@ class SelaVprConfig(Aggregator):
 def local_features(
     params: SelaVpr | Fol, patches: Patches, grid: Grid
 ) -> Float[Array, "*batch rows columns local"]:
-    """Upsample the patches to a finer grid of unit-length local features, at least float32.
+    """Upsample the patches to a finer grid of unit-length local features, in at least float32.
 
     Args:
         params: parameters of the aggregator: two transposed convolutions, with a ReLU between.
@@ -91,7 +91,7 @@ def local_features(
 
 
 def upconv(params: Conv, x: Map) -> Map:
-    """Apply a transposed convolution, as torch's `nn.ConvTranspose2d(3, stride=2, padding=1)`.
+    """Apply a transposed convolution, like torch's `nn.ConvTranspose2d(3, stride=2, padding=1)`.
 
     It is computed as a convolution with the flipped kernel, after zeros are put between the pixels
     of `x`. The axes of the weight are row, column, input channel, output channel.

@@ -107,7 +107,7 @@ def init_head(key: PRNGKeyArray, dim: int, width: int) -> SelaVprPp:
 def head(params: SelaVprPp, patches: Patches) -> Float[Array, "*batch width"]:
     """Apply a linear layer, the generalised mean of its unit-length outputs, and a linear layer.
 
-    The result is at least float32, and not normalised.
+    The result is in at least float32, and not normalised.
     """
     mean = gem(linear(params.before, patches), params.p).astype(patches.dtype)
     return at_least_float32(linear(params.after, mean))

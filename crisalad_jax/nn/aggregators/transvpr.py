@@ -1,6 +1,6 @@
 """TransVPR's multi-level attention (Wang et al., CVPR 2022, section 3.2), for any backbone.
 
-A level is the output of a block; each patch has its levels side by side (`FeatureSpec.levels`).
+A level is the output of a block; the levels of a patch are concatenated (`FeatureSpec.levels`).
 """
 
 import jax
@@ -24,7 +24,7 @@ class TransVpr:
     """The layer that scores patches for every level, and the descriptor's linear layer."""
 
     attention: Linear
-    """Score layer without bias, which a softmax over patches would cancel."""
+    """Score layer. It has no bias, because the softmax over patches would cancel one."""
     reduction: Linear
 
 
@@ -66,14 +66,14 @@ class TransVprConfig(Aggregator):
 
 
 def attentions(params: TransVpr, patches: Patches) -> Float[Array, "*batch patch level"]:
-    """Compute each level's softmax over patches, from scores of all levels, at least float32."""
+    """Compute each level's softmax over patches, from all levels' features, in at least float32."""
     return jax.nn.softmax(at_least_float32(linear(params.attention, patches)), axis=-2)
 
 
 def key_features(
     params: TransVpr, patches: Float[Array, "*batch patch wide"], levels: int
 ) -> Patches:
-    """Return the middle level of key patches; other patches are 0.
+    """Return the middle level's features of the key patches, and 0 for all other patches.
 
     The attention of every level is rescaled to the range 0 to 1, summed over levels and rescaled
     again. Key patches are those above `KEY_THRESHOLD`. As in the public code, the results are not

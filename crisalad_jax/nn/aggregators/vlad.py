@@ -34,7 +34,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 RATIO = 100
-"""Initial ratio of a patch's largest share to its second largest, as in public implementations."""
+"""Initial ratio of a patch's two largest softmax shares, as in public implementations."""
 BURST = (8.0, 7.0, 1.0)
 """Initial slope, offset and power of VLAD-BuFF's burst weights, as published."""
 
@@ -55,14 +55,14 @@ class VladConfig(Aggregator):
 
     @abc.abstractmethod
     def sums(self, params: Any, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Return a sum over an image's unit patches for each cluster, in at least float32.
+        """Return each cluster's sum over an image's unit-length patches, in at least float32.
 
         All products use the highest precision: a small difference in scores or distances can move a
         patch to another cluster.
         """
 
     def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
-        """Scale patches to unit length, and return each cluster's sum as a local token."""
+        """Scale patches to unit length, and return the local tokens that `sums` computes."""
         patches = l2_normalise(at_least_float32(features.patches))
         return Tokens.of_local(self.sums(params, patches))
 
@@ -94,11 +94,11 @@ class NetVladConfig(VladConfig):
         )
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> NetVlad:
-        """Make parameters as the authors do from k-means centroids; see `scores_from_centroids`."""
+        """Make parameters from k-means centroids, like the authors; see `scores_from_centroids`."""
         return NetVlad(scores_from_centroids(centroids, features), centroids)
 
     def sums(self, params: NetVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-        """Sum residuals (Eq. 4), and normalise each sum (Arandjelovic and Zisserman 2013)."""
+        """Sum residuals per cluster (Eq. 4), normalise each (Arandjelovic and Zisserman 2013)."""
         return l2_normalise(residual_sums(shares(params.conv, patches), patches, params.centroids))
 
 
@@ -135,7 +135,7 @@ class SuperVladConfig(VladConfig):
         return SuperVlad(scores_from_centroids(centroids, features))
 
     def count_centroids(self, dim: int) -> int:
-        """Return the number of all clusters, ghosts included."""
+        """Return the total number of clusters, ghosts included."""
         return self.clusters + self.ghosts
 
     def sums(self, params: SuperVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
@@ -147,7 +147,7 @@ class SuperVladConfig(VladConfig):
 
 @pytree_dataclass
 class Reduction:
-    """Dimensionality reduction of a unit patch: `(patch - mean) @ rotation`."""
+    """Dimensionality reduction of a unit-length patch: `(patch - mean) @ rotation`."""
 
     mean: Float[Array, " dim"]
     rotation: Float[Array, "dim reduced"]
@@ -155,7 +155,7 @@ class Reduction:
 
 @pytree_dataclass
 class VladBuff:
-    """Parameters: the reduction, NetVLAD's for reduced patches, and those of burst weights."""
+    """Parameters of the reduction, of NetVLAD on reduced patches, and of the burst weights."""
 
     reduction: Reduction | None
     conv: Linear
@@ -226,7 +226,7 @@ class Words:
     """The visual words."""
 
     words: Centroids
-    """k-means centroids of unit features."""
+    """k-means centroids of unit-length features."""
 
 
 class WordsConfig(VladConfig):
@@ -235,7 +235,7 @@ class WordsConfig(VladConfig):
     trainable: ClassVar[bool] = False
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Words:
-        """Draw random unit vectors as words, until a vocabulary is built."""
+        """Draw random unit vectors as words; `from_centroids` replaces them."""
         return Words(l2_normalise(random_init.normal(key, (self.clusters, backbone.dim))))
 
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Words:
@@ -255,14 +255,14 @@ class AnyLocConfig(WordsConfig):
     facet: Literal["query", "key", "value", "token"] = "value"
     """Facet of the block: queries, keys or values of its attention, or its output tokens."""
     assignment: Literal["cosine", "euclidean"] = "cosine"
-    """How the nearest word of a patch is found, also by the k-means that builds a vocabulary. The
-    public code uses "cosine", the angle."""
+    """How the word nearest to a patch is found, in k-means too: by the angle ("cosine", as in the
+    public code) or by Euclidean distance."""
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the facet, without the last layer norm.
 
         Raises:
-            InputError: there is no such block.
+            InputError: `layer` is not the index of a block.
         """
         require_range(self, -depth, depth - 1, "layer")
         return FeatureSpec((self.layer % depth + 1,), self.facet, norm=False)
@@ -275,8 +275,8 @@ class AnyLocConfig(WordsConfig):
     def sums(self, params: Words, patches: Patches) -> Float[Array, "*batch cluster dim"]:
         """Compute VLAD (Jegou et al. 2010): residuals from the nearest word, intra-normalised.
 
-        Words are not normalised before the subtraction. A word's sum is 0 if it is nearest to no
-        patch.
+        Words are not normalised before the subtraction. A word that is nearest to no patch has a
+        sum of 0.
         """
         nearest = nearest_words(params.words, patches, self.assignment)
         one_hot = jax.nn.one_hot(nearest, len(params.words), dtype=patches.dtype)
@@ -330,11 +330,11 @@ def fit_reduction(features: FeatureRows, reduced: int) -> Reduction:
     """Fit the mean and the first principal components of features, without whitening.
 
     Args:
-        features: at least `reduced` of them, and at least that wide.
+        features: at least `reduced` vectors, of at least `reduced` dimensions.
         reduced: number of components.
 
     Raises:
-        InputError: there are fewer features, or they are narrower.
+        InputError: there are fewer features, or fewer dimensions, than components.
     """
     require(
         min(features.shape) >= reduced,

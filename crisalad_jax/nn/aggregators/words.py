@@ -46,9 +46,9 @@ class Bow:
     """The visual words and their weights."""
 
     words: Centroids
-    """k-means centroids of unit features; for binary features, the majority of each bit."""
+    """k-means centroids of unit-length features; for binary features, the majority of each bit."""
     weights: Float[Array, " cluster"]
-    """log(N / n) of a word that n of the N images of the vocabulary contain."""
+    """log(N / n) for a word in n of the N images from which the vocabulary was built."""
 
 
 @AGGREGATORS.register("bow", tiny={"clusters": 100})
@@ -68,7 +68,7 @@ class BowConfig(Aggregator):
         return self.clusters
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Bow:
-        """Draw random unit vectors as words of equal weight, until a vocabulary is built."""
+        """Draw random unit vectors as words of equal weight; `from_centroids` replaces them."""
         words = l2_normalise(random_init.normal(key, (self.clusters, backbone.dim)))
         return Bow(words, random_init.ones(self.clusters))
 

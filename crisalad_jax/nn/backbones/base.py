@@ -31,7 +31,7 @@ class Features(NamedTuple):
     patches: Patches
     """One vector for each patch, in row order."""
     inserted: Float[Array, "*batch inserted dim"] | None = None
-    """One output vector for each of `FeatureSpec.inserted`; None if there are none."""
+    """One output vector for each token of `FeatureSpec.inserted`; None without such tokens."""
     class_attention: Float[Array, "*batch patch"] | None = None
     """Attention of the class token to each patch, summed over the heads of the last block, in at
     least float32; None unless `FeatureSpec.class_attention` requests it."""
@@ -58,7 +58,7 @@ class FeatureSpec:
     """Index of the adapters' side path whose tokens are the features; 0 if there is only one."""
     insertion: int | None = None
     """Number of blocks after which the aggregator's own tokens are prepended to all others. None
-    if it has none."""
+    if the aggregator has no tokens of its own."""
     inserted: Float[Array, "inserted dim"] | None = None
     """The aggregator's own tokens, the same for every image, from `Aggregator.inserted`."""
 
@@ -66,7 +66,7 @@ class FeatureSpec:
         """Return the requested levels as block numbers, for a backbone of `depth` blocks.
 
         Raises:
-            InputError: levels out of order or above `depth`, or several for a facet of attention.
+            InputError: levels are out of order or above `depth`, or an attention facet has several.
         """
         levels = (depth,) if self.levels is None else self.levels
         in_order = list(levels) == sorted(set(levels)) and 0 < levels[0] <= levels[-1] <= depth
@@ -102,20 +102,20 @@ class Backbone(Part, abc.ABC):
     exposes_levels: ClassVar[bool] = True
     """Whether features can be taken after blocks other than the last."""
     local_features: ClassVar[str | None] = None
-    """Features that the host extracts to replace pixels, "sift" or "orb"; None takes pixels."""
+    """Features that the host extracts to replace pixels, "sift" or "orb"; None for pixels."""
     binary: ClassVar[bool] = False
     """Whether its features, and so their visual words, take only two values."""
     encoded_size: ClassVar[tuple[int, int] | None] = None
-    """Height and width of the byte array of `local_features`; None if it takes pixels."""
+    """Height and width of the byte array of `local_features`; None if the input is pixels."""
     side_paths: ClassVar[int] = 1
     """Number of side paths of its adapters; 1 if there are none."""
     extras: ClassVar[str] = ""
-    """Settings for a one-line summary of a model, each after a comma."""
+    """Settings to append to a one-line summary of a model, each preceded by a comma."""
     trains: ClassVar[tuple[str, ...]] = ()
     """Names, or name patterns, of the parameters that are meant to be trained; by default none.
 
     They are those of adapters, named as in `init`, such as "blocks.*.adapter" or "lora". A run that
-    trains none of them must request it (`--trainable head,-adapters`)."""
+    trains none of them must exclude them by name (`--trainable head,-adapters`)."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:
@@ -146,7 +146,7 @@ class Backbone(Part, abc.ABC):
     def split_blocks(self, params: Any, cuts: Sequence[int]) -> Any:
         """Return parameters with the stack `params.blocks` cut before the blocks of these indices.
 
-        Implement it if leaves of `params.blocks` have a leading axis of `depth` blocks. Training
+        Implement this if leaves of `params.blocks` have a leading axis of `depth` blocks. Training
         cuts the stack so that some blocks train and no gradient passes through frozen ones before
         them. The parts form a tuple; `apply` accepts a stack or such a tuple.
 

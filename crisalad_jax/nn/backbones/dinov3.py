@@ -51,7 +51,7 @@ class DinoV3Config(VisionTransformer):
         return _rotation(grid, self.dim // self.heads)
 
     def attention_of(self, layer: Block) -> Attention:
-        """Return a block's attention with the bias of keys set to 0, so that it has no gradient.
+        """Return a block's attention with the keys' bias set to 0, so that it has no gradient.
 
         With rotated keys a bias would not cancel in the softmax.
         """
@@ -78,7 +78,7 @@ def rotary_angles(grid: Grid, head_dim: int) -> np.ndarray:
         head_dim: width of an attention head.
 
     Returns:
-        (patch, head_dim / 2) in radians, patches in row order.
+        The angles in radians, of shape (patch, head_dim / 2); patches are in row order.
 
     Example:
         >>> rotary_angles((1, 2), 4).round(3).tolist()

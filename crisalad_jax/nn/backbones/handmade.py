@@ -33,7 +33,7 @@ class WholeImageBackbone(HandmadeBackbone):
     """Height and width in pixels that images must have."""
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
-        """Return 1 x 1: the image is one patch. Raise InputError if the size is not `size`."""
+        """Return 1 x 1: the image is one patch. Raise InputError for any size but `size`."""
         found, expected = (f"{height} x {width}" for height, width in (image_size, self.size))
         require(
             found == expected,

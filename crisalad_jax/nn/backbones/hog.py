@@ -23,8 +23,8 @@ class HogConfig(WholeImageBackbone):
 
     Sobel gradients of the grey image vote for the two nearest of 9 bins of unsigned angles, with
     linear weights. Cells have 8 x 8 pixels. Blocks of 2 x 2 cells, one cell apart, are divided by
-    their L2 norms. In a uniform image, all entries are equal. The descriptor, without parameters,
-    is the class token. Preprocessing must leave pixels at 0 to 255: mean 0 and deviation 1/255.
+    their L2 norms. In a uniform image, all entries are equal. The descriptor is the class token;
+    there are no parameters. Preprocessing must leave pixels at 0 to 255: mean 0, deviation 1/255.
     """
 
     dim: int = _DIM

@@ -26,7 +26,7 @@ class _LocalFeatureBackbone(HandmadeBackbone):
     exposes_levels: ClassVar[bool] = False
     local_features: ClassVar[LocalFeatures]
     count: PositiveInt = 500
-    """Maximum number of features per image; of more, the strongest are used."""
+    """Maximum number of features per image; if there are more, the strongest are used."""
 
     @property
     def encoded_size(self) -> tuple[int, int]:

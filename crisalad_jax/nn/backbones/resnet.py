@@ -127,7 +127,7 @@ def residual(params: Residual, x: Map, valid: Valid, *, stride: int) -> tuple[Ma
     """Add the output of the convolutions to the input; the first 3 x 3 convolution has the stride.
 
     Returns:
-        (y, updated): the output after a ReLU, and the block as `conv_norm` returns its layers.
+        (y, updated): the output after a ReLU, and the block, updated as in `conv_norm`.
     """
     y, convs, shortcut = x, [], params.shortcut
     strided = next(i for i, each in enumerate(params.convs) if each.conv.weight.shape[0] == 3)

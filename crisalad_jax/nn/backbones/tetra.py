@@ -60,7 +60,7 @@ class TetraBlock:
 
 @pytree_dataclass
 class TetraVit:
-    """Parameters of the backbone. Leaves of `blocks`, the ternary ones, have a leading axis."""
+    """Parameters of the backbone. Leaves of `blocks` (ternary blocks) have a leading depth axis."""
 
     pos_embed: Float[Array, "token dim"]
     """Positions of the class token, then of the patches in row order."""
@@ -154,7 +154,7 @@ class TetraVitConfig(Backbone):
 
 
 def embed(params: TetraVit, images: Pixels, config: TetraVitConfig) -> TokenBatch:
-    """Return class token and patches, normalised before and after embedding, plus positions."""
+    """Embed patches, normalised before and after, prepend the class token, and add positions."""
     count, side, size = images.shape[0], config.position_grid, config.patch_size
     pixels = images.reshape(count, side, size, side, size, 3).swapaxes(2, 3)
     patches = layer_norm(params.patch_norm, pixels.reshape(count, side**2, 3 * size**2))
@@ -178,8 +178,8 @@ def block(params: TetraBlock, x: TokenBatch, heads: int) -> TokenBatch:
 def ternary_linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
     """Apply a linear layer with its weights rounded to ternary ones, and `x` to 8-bit steps.
 
-    A weight is -1, 0 or 1 times the mean magnitude of all. Rounding is half to even. Sums of steps
-    are integers below 2^24, exact in float32. Gradients pass straight through the rounding.
+    A weight is -1, 0 or 1 times the weights' mean magnitude. Rounding is half to even. Sums of
+    steps are integers below 2^24, exact in float32. Gradients pass straight through the rounding.
 
     Args:
         params: the layer, whose weight is rounded here.

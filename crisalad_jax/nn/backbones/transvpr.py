@@ -75,7 +75,7 @@ class TransVprNet:
 
 @BACKBONES.register("transvpr-net", tiny={"dim": 64, "depth": 4})
 class TransVprNetConfig(Backbone):
-    """TransVPR's convolutions and transformer, without positions (Wang et al., CVPR 2022)."""
+    """TransVPR's convolutions and transformer; no position embeddings (Wang et al., CVPR 2022)."""
 
     patch_size: ClassVar[int] = 16
     dim: PositiveInt = 256

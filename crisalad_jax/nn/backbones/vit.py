@@ -114,9 +114,9 @@ class ViT:
 
     Leaves of `blocks` have a leading depth axis, which is shorter for adapters if only the last
     blocks have one. `blocks` may also be a tuple of such stacks, which run in sequence: training
-    makes one to exclude frozen blocks from the gradient if only the last ones train. Rotary
-    positions have no parameters: `pos_embed_cls` and `pos_embed` are None. So is `register_tokens`
-    without registers.
+    uses a tuple to exclude frozen blocks from the gradient if only the last ones train. With rotary
+    positions, which have no parameters, `pos_embed_cls` and `pos_embed` are None. Without
+    registers, `register_tokens` is None.
     """
 
     patch_embed: Linear
@@ -161,7 +161,7 @@ class VisionTransformer(Backbone):
 
     @property
     def hidden(self) -> int:
-        """Feed-forward width: dim * mlp_ratio; for SwiGLU 2/3 of that, up to a multiple of 8."""
+        """Feed-forward width dim * mlp_ratio; SwiGLU: 2/3 of it, rounded up to a multiple of 8."""
         hidden = int(self.dim * self.mlp_ratio)
         return (int(hidden * 2 / 3) + 7) // 8 * 8 if self.ffn == "swiglu" else hidden
 
@@ -280,8 +280,8 @@ class VisionTransformer(Backbone):
 
         Raises:
             InputError: during tracing, if levels are out of order or exceed the number of blocks,
-                or for more than one of these: levels or a facet, inserted tokens, the class token's
-                attention, adapters on a side path.
+                or if more than one of these is used: levels or a facet, inserted tokens, the class
+                token's attention, adapters on a side path.
         """
         levels = _checked_levels(request, self)
         stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
@@ -419,8 +419,8 @@ class ViTConfig(VisionTransformer):
     position_grid: PositiveInt = 37
     """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
     position_resize: Literal["dinov2", "plain"] = "dinov2"
-    """How that grid is resized to the patches of an image: "dinov2" antialiases if there are
-    registers, "plain" never does."""
+    """How the grid of position embeddings is resized to the patches of an image: "dinov2"
+    antialiases if there are registers, "plain" never does."""
     position_init: Literal["random", "sincos"] = non_semantic_field("random")
     """Initialisation of the position embeddings if no weights are loaded."""
 
@@ -433,7 +433,7 @@ class ViTConfig(VisionTransformer):
     def init_positions(
         self, key: PRNGKeyArray
     ) -> tuple[Float[Array, " dim"], Float[Array, "grid grid dim"]]:
-        """Draw the positions of patches, or compute sine-cosine codes; the class token's is 0."""
+        """Draw the positions of patches, or compute sine-cosine codes; the class token gets 0."""
         side = self.position_grid
         if self.position_init == "sincos":
             positions = jax.device_put(_sincos_positions(side, self.dim).astype(np.float32))

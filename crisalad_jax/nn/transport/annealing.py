@@ -34,7 +34,7 @@ class AnnealingStep(Step):
         """Take both half steps at the larger epsilon of this iteration.
 
         Raises:
-            InputError: the problem's marginals are relaxed.
+            InputError: `row_tau` or `column_tau` is below 1.
         """
         check_balanced(problem, "annealing")  # the meaning of tau changes with epsilon
         left = jnp.maximum(1 - iteration / self.cooling, 0)

@@ -124,7 +124,7 @@ def _rounding(*log_masses: Array) -> float:
 def equal_totals(log_mu: Array, log_nu: Array, wide: jnp.dtype) -> tuple[Array, Array]:
     """Widen marginals to `wide`; if any was narrower, scale the columns' to the rows' total.
 
-    Totals that differ by more than rounding explains stay as they are.
+    Totals that differ by more than rounding can explain are not changed.
     """
     allowed, types = _rounding(log_mu, log_nu), (log_mu.dtype, log_nu.dtype)
     log_mu, log_nu = log_mu.astype(wide), log_nu.astype(wide)
@@ -140,7 +140,7 @@ def check_start(config: SinkhornConfig, problem: Problem, params: Any) -> None:
     """Check that a start returns potentials of the problem's shapes.
 
     Raises:
-        InputError: shapes differ, or the start needs parameters; the message names the start.
+        InputError: the shapes differ, or parameters are missing; the message names the start.
     """
     start, name = config.start, f"start {config.start.part_name}"
     _check_params(name, start, params, "start_params")
@@ -158,7 +158,7 @@ def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
     """Check that a step returns potentials and a state of the shapes that it was given.
 
     Raises:
-        InputError: shapes differ, or the step needs parameters; the message names the step.
+        InputError: the shapes differ, or parameters are missing; the message names the step.
     """
     step, name = config.step, f"step {config.step.part_name}"
     _check_params(name, step, params, "step_params")

@@ -15,7 +15,7 @@ from crisalad_jax.nn.transport.steps import STEPS, Step
 
 
 class Solution(NamedTuple):
-    """The potentials after the iterations, and how many there were."""
+    """The potentials after the iterations, and the number of iterations."""
 
     potentials: Potentials
     iterations: Int[Array, "*batch"]
@@ -66,8 +66,8 @@ class SinkhornConfig:
     throw: bool = False
     """Whether to raise if the tolerance is not met; otherwise the result reports it."""
     domain: Literal["scaling", "log"] = "scaling"
-    """Domain of the sums. "scaling" computes exponentials once; problems whose scores are too far
-    apart for it are solved again in the "log" domain."""
+    """Domain of the sums. "scaling" computes exponentials once; a batch with scores too far apart
+    for it is solved again in the "log" domain."""
     anderson_memory: NonNegativeInt = 0
     """Number of past iterations that Anderson acceleration uses, at least 2; 0 disables it."""
     gradient: OrName[Gradient] = part_field(GRADIENTS, "unrolled")

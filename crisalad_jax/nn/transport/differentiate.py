@@ -17,7 +17,7 @@ from crisalad_jax.utils.target import target
 def solve_in_domain(
     problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
 ) -> Solution:
-    """Iterate in the configured domain; problems with scores too far apart for it use "log"."""
+    """Iterate in the configured domain, or in "log" if any scores are too far apart for it."""
     # Leaving the scaling domain takes a branch.
     if config.domain == "log" or not target().branches:
         return iterate(problem, config, params, init)

@@ -42,10 +42,10 @@ def sinkhorn_divergence(
         config: the solver of the three problems, of which only the potentials are used.
 
     Returns:
-        The divergence of each pair, in float32 at least.
+        The divergence of each pair, in at least float32.
 
     Raises:
-        InputError: the tokens differ in width or batch; or what `solve` raises.
+        InputError: the tokens differ in width or batch, or `solve` rejects an argument.
 
     Example:
         >>> x = jnp.eye(3)

@@ -1,8 +1,8 @@
 """Dustbins, which take the patches that belong to no cluster, and their marginals.
 
-`marginals` sets the mass of a dustbin: what the clusters leave for "column" and "token" (see
-`log_marginals`), all patches for "row and column", a learnt share for "mass". The mass is separate
-from the score that the dustbin appends.
+`marginals` sets the mass of a dustbin: for "column" and "token", what the clusters leave (see
+`log_marginals`); for "row and column", that of all patches; for "mass", a learnt share. The mass is
+separate from the score that the dustbin appends.
 """
 
 import math
@@ -62,7 +62,7 @@ class Dustbin(Part):
 
         Args:
             params: the learnt parameters, or an array of the shape that the dustbin expects.
-            scores: scores of each patch for each cluster, in float32 at least.
+            scores: scores of each patch for each cluster, in at least float32.
             patches: the patches' features; None outside of a model.
         """
         raise NotImplementedError
@@ -99,7 +99,7 @@ class ScalarDustbin(Dustbin):
 
 @DUSTBINS.register("column")
 class ColumnDustbin(ScalarDustbin):
-    """A column with one learnt score, as published; plain iterations do not depend on the score."""
+    """A column with one learnt score, as published; the score has no effect on plain iterations."""
 
     takes_difference: ClassVar[bool] = True
 
@@ -131,7 +131,7 @@ class TokenDustbin(Dustbin):
     takes_difference: ClassVar[bool] = True
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
-        """Use each patch's last score as the dustbin's, or `params` with one score per patch."""
+        """Use `params`, one score per patch, as the dustbin's; if None, each patch's last score."""
         if params is None:
             scores, params = scores[..., :-1], scores[..., -1]
         return _with_column(scores, check_params(params, *scores.shape[:-1]))

@@ -74,11 +74,11 @@ class PartialDustbin(Dustbin):
 
 @STEPS.register("partial")
 class PartialStep(Step):
-    """Transport of all mass but the last column's marginal, within the marginals of the others.
+    """Step that moves all mass but the last column's marginal, within the other columns' marginals.
 
-    The last column of the plan is what patches keep; its scores have no effect. Columns and their
-    level are solved for together, then the rows. So the moved total is met at convergence, and
-    patches give at most their mass after every iteration.
+    The last column of the plan is what patches keep; its scores have no effect. An iteration solves
+    for the columns and the level that bounds their potentials, then for the rows. So the moved
+    total is met at convergence, and patches give at most their mass after every iteration.
     """
 
     capacities: ClassVar[bool] = True

@@ -14,8 +14,8 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 SCALING_RANGE = 60
 """Bound on the difference of two scores of a row, divided by epsilon, in the scaling domain.
 
-Below it the sums are exact up to rounding: none is less than exp(-60), whatever the potentials, and
-terms below exp(-87), which float32 flushes to zero, are too small to change such a sum."""
+Below this bound sums are exact up to rounding: no sum is less than exp(-60), whatever the
+potentials, and terms below exp(-87), which float32 flushes to zero, are too small to matter."""
 
 LOG_ZERO = -1e5
 """Logarithm below which a mass counts as 0: no float format can represent exp(-1e5)."""
@@ -53,8 +53,8 @@ class Problem:
         log_mu: logarithms of the rows' masses (required sums); `EMPTY` for a mass of 0.
         log_nu: logarithms of the columns' masses, those of the last column included.
         taus: tau of the rows, and tau of the columns. None for sums that meet the marginals
-            exactly; else an array of shape (*batch, 1), below 1: a Kullback-Leibler penalty of
-            weight epsilon * tau / (1 - tau) pulls the sums there (Chizat et al., Math. Comp. 2018).
+            exactly; else an array (*batch, 1) below 1: a Kullback-Leibler penalty of weight
+            epsilon * tau / (1 - tau) pulls sums to the marginals (Chizat et al., Math. Comp. 2018).
 
     Example:
         >>> problem = Problem.of(jnp.eye(2), jnp.zeros(2), jnp.zeros(2))
@@ -153,7 +153,7 @@ class Problem:
 
 @pytree_dataclass
 class ScalingProblem(Problem):
-    """A problem with sums taken in the scaling domain: exponentials once, then matrix products.
+    """A problem in the scaling domain: exponentials once, then sums as matrix products.
 
     Attributes:
         row_max: each row's largest score, divided by epsilon.

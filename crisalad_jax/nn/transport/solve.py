@@ -37,14 +37,14 @@ class SinkhornResult(NamedTuple):
 
     log_plan: Matrix
     potentials: Potentials
-    """Dual variables divided by epsilon. In balanced entropic transport they are unique up to a
-    constant, so the columns' mean is set to 0. Pass them as `init` to start the next solve. Those
-    of rows and columns of mass 0 are very low, and do not count in the mean."""
+    """Dual variables divided by epsilon. In balanced entropic transport (both taus 1) they are
+    unique up to a constant, so the columns' mean is set to 0. Pass them as `init` to start the next
+    solve. Those of rows and columns of mass 0 are very low, and do not count in the mean."""
     row_error: Float[Array, "*batch"]
     """Largest relative error of a row's mass: |mass / marginal - 1|, or 0 for a marginal of 0."""
     column_error: Float[Array, "*batch"]
-    """Largest relative error of a column's mass. Rows are updated last, so iterations reduce it. If
-    the step has capacities, only a mass above its marginal is an error."""
+    """Largest relative error of a column's mass. Rows are updated last, so iterations reduce
+    this error. If the step has capacities, only a mass above its marginal is an error."""
     iterations: Int[Array, "*batch"]
     """Number of iterations taken."""
     converged: Bool[Array, "*batch"]
@@ -92,8 +92,8 @@ def solve(
         epsilon: entropic regularisation, above 0: one value for all problems of the batch, or one
             for each. It may be traced or learnt.
         row_tau: 1 for rows that meet their marginals exactly; below 1 a Kullback-Leibler penalty of
-            epsilon * row_tau / (1 - row_tau) pulls their sums there. An array, of one value or one
-            for each problem, may be traced or learnt, and must stay below 1.
+            weight epsilon * row_tau / (1 - row_tau) pulls their sums to the marginals. An array, of
+            one value or one for each problem, may be traced or learnt, and must stay below 1.
         column_tau: the same for columns.
         config: step, stopping rule and gradient; a static argument.
         init: potentials to start from, such as those of an earlier result; by default those of
@@ -106,12 +106,12 @@ def solve(
         The plan's logarithm, the potentials, and how well the plan meets its marginals.
 
     Raises:
-        InputError: complex scores; shapes that do not fit; a step or start whose potentials do not
-            fit the problem. If values are known (outside of `jit` and `grad`): scores that are not
-            finite; an `init` with NaN; masses that are NaN, infinite or all 0; different totals; a
-            tau out of range; an epsilon that is not positive or too small. With `config.throw`: a
-            tolerance that was not met; inside of `jit` it is instead a RuntimeError of the compiled
-            program, raised only if the program uses a value of the result.
+        InputError: scores are complex; shapes do not fit; or the step or start lacks parameters or
+            returns other shapes. If values are known (outside of `jit` and `grad`): scores are not
+            finite; `init` has a NaN; masses are NaN, infinite or all 0; totals differ; a tau is out
+            of range; or epsilon is not positive or too small. With `config.throw`: the tolerance is
+            not met. Inside of `jit` this is instead a RuntimeError of the compiled program, raised
+            only if the program uses a value of the result.
 
     Example:
         >>> import jax.numpy as jnp
@@ -208,7 +208,7 @@ def assign_with_dustbin(
     patches: Float[Array, "*batch patches dim"] | None = None,
     **options: Any,
 ) -> SinkhornResult:
-    """Assign patches to clusters by transport, with a dustbin for patches without a cluster.
+    """Assign patches to clusters by transport, with a dustbin for patches that fit no cluster.
 
     Args:
         scores: scores of each patch for each cluster.
@@ -225,9 +225,9 @@ def assign_with_dustbin(
         the dustbin. A row of the dustbin is left out of the plan.
 
     Raises:
-        InputError: what `solve` raises; too few patches for a dustbin whose mass is the number of
-            patches minus that of clusters; parameters of another shape; or a dustbin with
-            capacities and a step without.
+        InputError: the dustbin's mass is the number of patches minus that of clusters, which is not
+            positive; `params` have another shape than the dustbin needs; the dustbin has
+            capacities, but the step does not support them; or `solve` raises it.
 
     Example:
         >>> import jax.numpy as jnp

@@ -15,8 +15,8 @@ from crisalad_jax.nn.transport.steps import STEPS, Moved, SinkhornStep, Step, ch
 class QuadraticStep(Step):
     """Quadratic transport: maximise <P, S> - epsilon / 2 * |P|^2 (Blondel et al., AISTATS 2018).
 
-    The plan P is sparse: the positive part of S / epsilon + row + column, for scores S. A half
-    step, a projection onto a simplex, meets one side's marginals exactly. Both taus must be 1.
+    The plan P is sparse: the positive part of S / epsilon + row + column, for scores S. Each half
+    step projects onto simplices, to meet the marginals of one side exactly. Both taus must be 1.
 
     Example:
         >>> from crisalad_jax.sinkhorn import SinkhornConfig, solve

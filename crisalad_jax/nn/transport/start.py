@@ -37,7 +37,7 @@ class Start(Part, abc.ABC):
 
         Steps update the column potentials first, from those of the rows, so return row potentials
         that fit the columns (`from_columns`). With the gradient "unrolled", gradients flow through
-        the start. The gradient of a converged solution does not depend on it.
+        the start. The gradient of a converged solution does not depend on the start.
         """
 
 

@@ -28,7 +28,7 @@ Moved = tuple[Potentials, Any]
 class Step(Part, abc.ABC):
     """One iteration of a transport solver: a frozen dataclass whose fields are its settings.
 
-    A subclass must define only `step`. Stopping, acceleration and gradients use the methods and
+    A subclass need only define `step`. Stopping, acceleration and gradients use the methods and
     attributes of a step, never its name.
 
     Example:
@@ -75,8 +75,8 @@ class Step(Part, abc.ABC):
     def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
         """Return the error that `tolerance` limits: by default the largest change of a potential.
 
-        In a balanced problem a constant that moves between rows and columns does not count. The
-        rest is, to first order, the relative marginal error that the step corrected.
+        In a balanced problem a constant moved from row to column potentials does not count. What
+        remains is, to first order, the relative marginal error that the step corrected.
         """
         row, column = new.row - old.row, new.column - old.column
         if problem.balanced and not self.capacities:
@@ -115,7 +115,7 @@ class SinkhornStep(Step):
     """Meet the columns' marginals, then the rows' (Eq. 5 of the CriSALAD paper).
 
     A `relaxation` of w makes each half step w times as long, in every entry where that does not
-    lower the dual objective (Thibault et al., Algorithms 2021, with one w for all entries).
+    lower the dual objective (Thibault et al., Algorithms 2021, use one w for all entries).
     """
 
     entropic: ClassVar[bool] = True
@@ -150,7 +150,7 @@ class SinkhornStep(Step):
         return jnp.where(gain >= 0, new + beyond, new)
 
     def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
-        """Meet the rows' marginals again, as a relaxed step may miss them.
+        """Meet the rows' marginals again, as an over-relaxed step may miss them.
 
         Otherwise the rows' masses could overflow.
         """
@@ -161,7 +161,7 @@ class SinkhornStep(Step):
 
 
 LONGEST = (8.0, 2.0, 0.5)
-"""Largest changes of a potential that Newton's step tries, in multiples of the temperature."""
+"""Limits on the change of a potential that Newton's step tries, in multiples of the temperature."""
 COOLING = 1.5
 """Factor between successive temperatures of Newton's step."""
 FAR = 3.0
@@ -175,8 +175,8 @@ class NewtonStep(Step):
     """Newton's method on the semi-dual, a concave function of only the column potentials.
 
     The rows' marginals are always met (Brauer et al., 2017), and the Hessian is the Laplacian of a
-    weighted graph of the columns. Of Sinkhorn's change of the potentials, and Newton's clipped to
-    several lengths, a step takes the one with the largest semi-dual, which therefore never falls.
+    weighted graph of the columns. A step tries Newton's change of potentials, clipped to several
+    lengths, and Sinkhorn's. It takes the one with the largest semi-dual, which never falls.
 
     If scores differ by too many epsilons, epsilon is at first multiplied by a temperature, which
     falls to 1 as the errors fall. The step's state is the next temperature. Both taus must be 1.
@@ -211,7 +211,7 @@ class NewtonStep(Step):
         return Potentials(row, column), lower
 
     def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
-        """Return the remaining marginal error: far from the solution a change may be small."""
+        """Return the remaining marginal error: a change may be small even far from the solution."""
         return _marginal_error(problem, new)
 
 
@@ -336,7 +336,7 @@ def solve_columns(
 
     The matrix is diag(masses / column_tau) - row_tau * shares^T plan, with the plan's column sums
     as masses, written as a Laplacian to avoid cancellation. If both taus are 1, the unknown of the
-    heaviest column is set to 0: with that of a column without mass, the matrix would be singular.
+    heaviest column is set to 0; fixing one without mass instead would leave the matrix singular.
 
     Args:
         plan: the plan's masses.

@@ -58,7 +58,7 @@ def format_answers(path: str | os.PathLike[str], answers: Answers) -> tuple[str,
         The file's text, and the number of queries in it.
 
     Raises:
-        InputError: what `check_positions` raises.
+        InputError: the file needs positions that the map lacks (see `check_positions`).
     """
     check_positions(path, answers.axes, answers.zone)
     return _WRITERS.get(_suffix(path), _json_lines)(answers)

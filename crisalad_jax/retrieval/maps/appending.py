@@ -102,7 +102,7 @@ class AppendableMap(Map):
             added: new images.
 
         Raises:
-            InputError: no image is left, more than `MOST_CHANGED` change, or as in `append`.
+            InputError: no image is left, more than `MOST_CHANGED` change, or `append` would fail.
         """
         self._check_there()
         gone = set(removed)
@@ -148,7 +148,7 @@ class AppendableMap(Map):
     def fitted_anew(self, positions: Positions) -> Positions:
         """Convert new positions of images to the map's axes and zone.
 
-        Other axes are left as they are if no other image has a position.
+        Positions in other axes stay as they are if no other image of the map has a position.
 
         Raises:
             InputError: they don't fit the map's axes or zone, see `Positions.fitted`.
@@ -220,7 +220,7 @@ def open_for_appending(
 
     Raises:
         InputError: another process is appending; the folder holds a different map, or one that has
-            lost a record of images; what `Map.open` raises; or the folder cannot be written to.
+            lost a record or is damaged otherwise; or the folder cannot be written to.
     """
     folder = pathlib.Path(folder)
     read_metadata(folder)  # raises if something else is there, before anything is created

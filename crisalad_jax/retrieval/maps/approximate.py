@@ -58,18 +58,18 @@ class Approximate(NamedTuple):
 
     kind: str
     ask: Callable[[Queries, int, int, Removed], Neighbours]
-    """Returns k candidates per query from (queries, k, count, removed); missing ones are -1."""
+    """Returns k candidates per query for (queries, k, count, removed); missing ones are -1."""
     store: Store
     recall: float
-    """Share of the exact neighbours found at building (`NEIGHBOURS`, `SAMPLE`); NaN if unknown."""
+    """Share of exact neighbours found when it was built (see `NEIGHBOURS`); NaN if unknown."""
     is_served: bool = False
     """Whether Milvus finds the candidates, however few descriptors are left after removals."""
 
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors by ranking candidates exactly.
 
-        Queries with fewer than k candidates are searched exactly, as are maps in files with less
-        than a tenth left. Removed descriptors are never candidates; others take their place.
+        A query with fewer than k candidates is searched exactly, as is a map in files with less
+        than a tenth of its descriptors left. Descriptors in `removed` are never found.
 
         Raises:
             InputError: the store is damaged or gone.

@@ -144,8 +144,8 @@ def index(
         position_topic: the topic of positions in a log; "none" takes none (see `open_source`).
         positions: where images were taken, or a table or track of positions (`read_track`). None
             takes them from `images`, if that is a table or a robot log; else from @UTM names; else
-            from the EXIF data of JPEGs. Names in several UTM zones become degrees, or metres in the
-            map's zone.
+            from the EXIF data of JPEGs. If @UTM names are in several zones, positions become
+            degrees, or metres in an existing map's zone.
         every_metres: minimum distance in metres from the last selected image of the same folder or
             video. Nearer images are left out; images without a position are not. None takes all.
         novelty: maximum cosine similarity to the last selected image of the same folder or video;
@@ -166,10 +166,10 @@ def index(
         Counts and names of the images, by what was done with them.
 
     Raises:
-        InputError: parameters of another configuration; no image, or none that can be read;
-            positions that match none of them; a number out of range; a map of another model or of
-            other settings, that another process is changing, or that cannot be written to; a name
-            that the map has for another image; or descriptors that are not unit vectors.
+        InputError: the parameters do not match the configuration; no image is readable; `positions`
+            match no image; a number is out of range; the map has another model or other settings,
+            another process is changing it, or it cannot be written to; the name of an image belongs
+            to a different image in the map; or descriptors are not unit vectors.
 
     Example:
         >>> import jax

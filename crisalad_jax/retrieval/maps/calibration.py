@@ -28,7 +28,7 @@ class Calibration:
     """Number of queries that were answered, `right` of them correctly."""
     right: int
     queries: int
-    """Number of all queries of the set."""
+    """Total number of queries in the set."""
     unknown: int
     """Number of queries without a positive, `unknown_answered` of which were answered."""
     unknown_answered: int

@@ -68,7 +68,7 @@ class MapChange(NamedTuple):
     stay_out: int = 0
     """Number of images that were removed from the map before, and are not merged into it."""
     stale_search: str | None = None
-    """Kind of an approximate search that is unused, as its index lacks images; None otherwise."""
+    """Kind of the approximate search, if it is unused because its index lacks images; else None."""
 
 
 def find_images(
@@ -80,7 +80,7 @@ def find_images(
         Their numbers in order, and how many of the named images had been removed before.
 
     Raises:
-        InputError: no such addition or day, or a name or pattern that matches no image.
+        InputError: the map has no such addition or day, or a name or pattern matches no image.
     """
     additions = places.additions
     ends = [0, *itertools.accumulate(each.images for each in additions)]
@@ -188,8 +188,8 @@ def replace_images(
         What was replaced; `unmatched` lists names in `images` that the map does not have.
 
     Raises:
-        InputError: another model; no image whose name is in the map; an unreadable image under
-            "stop", or no readable one; or the map cannot be opened for changes.
+        InputError: `model` did not make the map; no image's name is in the map; none is readable,
+            or an unreadable one is not skipped; or the map cannot be opened for changes.
 
     Example:
         >>> import cv2, jax
@@ -268,7 +268,7 @@ def move_images(
         What was moved.
 
     Raises:
-        InputError: positions that match none of the images, or don't fit the map's axes or zone; or
+        InputError: the positions match none of the images, or don't fit the map's axes or zone; or
             the map cannot be opened for changes.
 
     Example:
@@ -321,9 +321,9 @@ def merge_maps(
         What was appended.
 
     Raises:
-        InputError: maps of different models or settings; a name that two different images have;
-            positions that don't fit the map's axes or zone; another store than the map's; or a map
-            that cannot be opened.
+        InputError: models or settings of the maps differ; two different images have the same name;
+            positions don't fit the map's axes or zone; `store` is not that of an existing map; or a
+            map cannot be opened.
 
     Example:
         >>> import jax

@@ -110,8 +110,8 @@ class FileStore:
     ) -> Neighbours:
         """Find the k nearest of the first `count` descriptors, exactly.
 
-        They are compared by inner product, packed bits by the number of equal bits. Among equal
-        similarities the lower number comes first, also at the k-th place.
+        They are compared by inner product or, for packed bits, by the number of equal bits. Among
+        equal similarities the lower number comes first, also at the k-th place.
 
         Args:
             queries: unit vectors or packed bits.

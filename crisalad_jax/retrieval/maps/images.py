@@ -266,7 +266,7 @@ class Images(Sequence[MapImage]):
         """Return a copy without rows `removed`, and with rows `moved` at the new `positions`.
 
         Raises:
-            ValueError, TypeError, OverflowError: rows beyond the last, or as in `extend`.
+            ValueError, TypeError, OverflowError: a row does not exist, or a position is invalid.
         """
         rows = [*removed, *moved]
         if not all(isinstance(row, int) and 0 <= row < self.rows for row in rows):
@@ -325,7 +325,7 @@ def checked_positions(
     """Check positions, and return them as rows of a table, NaN where there is none.
 
     Raises:
-        ValueError, TypeError, OverflowError: unknown axes, or a position that is not a valid pair.
+        ValueError, TypeError, OverflowError: axes are unknown, or a position is not a valid pair.
     """
     if axes is not None and axes not in AXES:
         raise ValueError(f"found axes {axes}, expected one of {AXES}")

@@ -100,7 +100,7 @@ def query_live(
         The answer to each frame, with its latency.
 
     Raises:
-        InputError: another model, a number out of range, or what `source.frames` raises.
+        InputError: `model` did not make the map; a number is out of range; or the source fails.
 
     Example:
         >>> import jax, shutil

@@ -147,8 +147,8 @@ class Map:
             nothing refers to it any more.
 
         Raises:
-            InputError: there is no map, it has no images yet, or it or its store is damaged,
-                changed, gone, or of another format.
+            InputError: there is no map, or it has no images yet; or the map or its store is
+                damaged, changed, gone, or of another format.
 
         Example:
             >>> with Map.open("no-map") as places:
@@ -226,7 +226,7 @@ class Map:
         """Return this map or, if it has changed, close it and return a newly opened one.
 
         Raises:
-            InputError: what `open` raises.
+            InputError: the changed map cannot be opened; see `open`.
         """
         if not self._segments.has_more or not self.exists:
             return self
@@ -308,9 +308,9 @@ class Map:
             where: which images to search, in the syntax of `Where.parse`; None is all.
 
         Raises:
-            InputError: no queries, descriptors that are not unit vectors of the map's length, k
-                below 1; no image meets `where`, or what `Where.parse` raises; or the store is
-                damaged or gone.
+            InputError: there are no queries, or they are not unit vectors of the map's length; k is
+                below 1; `where` cannot be parsed (`Where.parse`), or no image meets it; or the
+                store is damaged or gone.
         """
         check_count("k", k)
         queries = self._rows("queries", queries)
@@ -326,7 +326,7 @@ class Map:
         """Return the rows that a search with conditions leaves out; the last result is cached.
 
         Raises:
-            InputError: no image is left; what `Where.parse` and `Where.left_out` raise.
+            InputError: `where` cannot be parsed (`Where.parse`), or no image meets it.
         """
         conditions = Where.parse(where) if isinstance(where, str) else where
         asked = conditions, self.images, self.images.rows
@@ -362,7 +362,7 @@ class Map:
             each of 100 images of the map. None for an exact search.
 
         Raises:
-            InputError: an unknown kind, one that Milvus lacks, or a map of bits.
+            InputError: the kind is unknown, not in Milvus or, for a map of bits, not exact.
         """
         metadata = self.metadata
         check_search(kind, metadata.store, metadata.dtype)
@@ -397,8 +397,8 @@ class Map:
             The answers, best first. Positions are in `axes`.
 
         Raises:
-            InputError: a file that cannot be read, an array that `prepare_image` does not take, k
-                below 1; what `load_model`, `describer` and `search` raise.
+            InputError: the file cannot be read, `prepare_image` does not accept the array, or k is
+                below 1; or `load_model`, `describer` or `search` raises it.
 
         Example:
             >>> import jax
@@ -430,7 +430,7 @@ class Map:
             queries: as `search` takes them.
 
         Raises:
-            InputError: what `search` raises.
+            InputError: the queries are not as `search` takes them.
         """
         queries = self._rows("queries", queries)
         queries = sign_vectors(queries) if self.metadata.is_bits else queries
@@ -496,7 +496,7 @@ class Map:
             its settings, and where descriptors are stored.
 
         Raises:
-            InputError: what the method `verify` raises.
+            InputError: the method `verify` finds a descriptor that has changed.
         """
         if verify:
             self.verify()
@@ -529,8 +529,8 @@ class Map:
     ) -> EngineName | Literal["jax"]:
         """Choose the engine that describes single images fastest, of those that agree with JAX.
 
-        It is ONNX Runtime or OpenVINO if one is installed and computes the same as JAX, and JAX has
-        no accelerator; otherwise "jax". Weights are exported for it the first time.
+        ONNX Runtime or OpenVINO is chosen if it is installed, supports the model and agrees with
+        JAX, and JAX has no accelerator; otherwise "jax". Weights are exported once for each engine.
 
         Args:
             weights: as in `load_model`, which takes the result as `engine`.
@@ -589,11 +589,11 @@ class Map:
 
         Args:
             model: the model; None uses the last one, or else loads it. The map's image size and
-                types replace those of its configuration.
+                data type replace those in the model's configuration.
             groupings: groupings of the queries.
 
         Raises:
-            InputError: another model, or one that does not support these groupings.
+            InputError: `model` did not make the map, or does not support these groupings.
         """
         if model is None and self._describer is None:
             self.load_model(groupings=groupings)

@@ -107,9 +107,9 @@ def new_metadata(
     """Make the metadata of a new map in `folder`, whose images `describer` will describe.
 
     Raises:
-        InputError: the model's descriptors are not unit vectors, or the components don't produce
-            unit vectors or expect another length; bits of a length that is not a multiple of 8; or
-            an invalid store or type.
+        InputError: `dtype` is not "bits", and the descriptors would not be unit vectors; `dtype` is
+            "bits", and their length is not a multiple of 8; the components were fitted to other
+            descriptors; or the store or type is invalid.
     """
     check_store(store, dtype)
     length, _ = shortened(pca, describer, str(weights), unit=dtype != "bits")
@@ -161,7 +161,7 @@ def existing_metadata(folder: str | os.PathLike[str]) -> MapMetadata:
     """Read the metadata of the map in `folder`.
 
     Raises:
-        InputError: there is no map, or what `read_metadata` raises.
+        InputError: there is no map, or `read_metadata` cannot read it.
     """
     metadata = read_metadata(folder)
     if metadata is None:

@@ -90,7 +90,7 @@ def check_address(address: str) -> bool:
     """Check a Milvus address; return True for an http address, False for a file.
 
     Raises:
-        InputError: it is neither, or an address with a user name.
+        InputError: it is neither, or contains a user name.
     """
     if address.startswith(("http://", "https://")):
         if "@" in urllib.parse.urlsplit(address).netloc:
@@ -343,7 +343,7 @@ class MilvusStore:
     ) -> Neighbours:
         """Find the k most similar descriptors for each query; see `FileStore.search`.
 
-        Milvus itself searches for kind "exact"; with others, all descriptors are read and compared.
+        With kind "exact" Milvus itself searches; with others all descriptors are read and compared.
         """
         require(k <= _MOST, f"k: found {k}, expected at most {_MOST}, the limit of Milvus")
         if self.kind != "exact":

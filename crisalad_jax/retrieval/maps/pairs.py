@@ -103,9 +103,9 @@ def image_pairs(
         The pairs of rule `overlap`, then `within`, then `k`, with each image's most similar first.
 
     Raises:
-        InputError: a number out of range; no rule; `overlap` or `within` with `images`; `within` in
-            a map without positions; `min_gap` without `k` or times in names; a name with spaces or
-            leading #; images that cannot be read; or what `Map.search` raises.
+        InputError: a number is out of range; no rule is given; `overlap` or `within` is given with
+            `images`; the map has no positions for `within`; `min_gap` is given without `k` or times
+            in names; a name has spaces or a leading #; images cannot be read; or the search fails.
 
     Example:
         >>> import jax
@@ -166,7 +166,7 @@ def check_rules(
         min_gap: seconds.
 
     Raises:
-        InputError: a number out of range, no rule, or one that is only for images of one map.
+        InputError: a number is out of range, no rule is given, or one is only for one map's images.
     """
     require(k >= 0, f"k: found {k}, expected at least 0")
     require(overlap >= 0, f"overlap: found {overlap}, expected at least 0")

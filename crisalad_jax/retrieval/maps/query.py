@@ -165,8 +165,8 @@ def query(
         The answers, which remain usable after the map is closed.
 
     Raises:
-        InputError: another model; no image, an unreadable one under "stop", or none readable; a
-            number out of range; answers that cannot be verified; or what `Map.search` raises.
+        InputError: `model` did not make the map; no image is readable, or an unreadable one is
+            not skipped; a number is out of range; answers cannot be verified; or the search fails.
 
     Example:
         >>> import jax
@@ -258,7 +258,7 @@ def answers_of(
     thresholds: Thresholds,
     **more: Any,
 ) -> Answers:
-    """Join the parts that `asking` found; `more` are other fields of `Answers`."""
+    """Join parts found by a function of `asking`; `more` are other fields of `Answers`."""
     indices, similarities, *filtered = map(np.concatenate, zip(*found, strict=True))
     neighbours = Neighbours(indices, similarities)
     more |= dict(zip(("probabilities", "best"), filtered, strict=False))  # of a filter
@@ -270,13 +270,13 @@ def verified(answers: Answers, verifier: Verifier, images: Iterable[np.ndarray],
     """Verify answers, rank the verified ones by their inliers, and return k per query.
 
     Args:
-        answers: what `asking` finds.
+        answers: the answers to verify, from `answers_of`.
         verifier: the verifier.
         images: the images of the queries.
         k: number of answers per query that are returned.
 
     Raises:
-        InputError: what `Verifier.check` raises.
+        InputError: answers cannot be verified; see `Verifier.check`.
     """
     indices, similarities = answers.neighbours
     rows = np.tile(np.arange(indices.shape[1]), (len(indices), 1))
@@ -311,7 +311,7 @@ def asked_thresholds(
     Args:
         places: the map, whose calibration may have them.
         min_similarity: as in `query`.
-        verifier: the verifier of answers, which may set the inliers; None verifies none.
+        verifier: the verifier, which may set the minimum of inliers; None without verification.
 
     Raises:
         InputError: the similarity is not a cosine; the calibration is damaged or of another model.
@@ -386,7 +386,7 @@ def json_lines(answers: Answers) -> Iterator[str]:
 
 
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
-    """Yield what `json_lines` writes for each query."""
+    """Yield the contents of each line of `json_lines`, as JSON values by name."""
     zone = {} if answers.zone is None else {"zone": str(answers.zone)}
     poses = answers.poses or [None] * len(answers.queries)
     columns = answers.names, answers.known, poses, answers.rows()

@@ -36,16 +36,14 @@ if TYPE_CHECKING:
 
 
 def source_of_map(places: Map) -> ImageSource:
-    """Find the image files of a map in the folders from which they were indexed.
-
-    Args:
-        places: the open map.
+    """Find the image files of an open map in the folders from which they were indexed.
 
     Returns:
         The files, their names, and the positions where the images were taken.
 
     Raises:
-        InputError: a file is missing or has another size; or one of several folders is remote.
+        InputError: a file is missing, or its size differs from the one that the map records; or the
+            map was indexed from several folders, and one of them is remote.
     """
     check_images(places)
     roots: dict[str, list[str]] = {}
@@ -116,9 +114,10 @@ def remake_map(
 ) -> int:
     """Rebuild a map by describing its images with another model.
 
-    The complete new map replaces the old one in a single step, so a call that is killed leaves one
-    of the two. Positions, folders, dates and the kind of search are preserved, not the calibration
-    and the record of removed images. Restart a running service, as it does not load the new map.
+    The complete new map replaces the old one in a single step, so a call that is killed leaves
+    either the old map or the new one. The new map has the positions, folders, dates and kind of
+    search of the old one, but neither its calibration nor its record of removed images. Restart a
+    running service (`serve_map`), as it does not load the new map.
 
     Args:
         folder: the map's folder.

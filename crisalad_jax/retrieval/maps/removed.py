@@ -16,8 +16,8 @@ class Removed(NamedTuple):
     rows: Int64[np.ndarray, " removed"] = np.empty(0, np.int64)
     """Indices of the removed rows in the store, in ascending order."""
     asked: "tuple[Where, Int64[np.ndarray, ' removed']] | None" = None
-    """The same rows as a filter for Milvus: conditions that images must meet as first added, and
-    rows to exclude in addition. None if the rows cannot be expressed like that."""
+    """The same choice of rows as a filter for Milvus: conditions that the remaining images met when
+    they were added, and rows to exclude as well. None if no such filter exists."""
 
     def has(self, row: int) -> bool:
         """Return whether a row was removed."""

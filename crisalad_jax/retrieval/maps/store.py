@@ -29,8 +29,8 @@ def check_store(name: str, dtype: str) -> None:
     """Check the name of a store, and that the store can hold descriptors of type `dtype`.
 
     Raises:
-        InputError: the name is neither "files" nor "milvus:URI", the URI is neither a file name.db
-            nor an http address, or the type is not in `DTYPES` or, in Milvus, not float32.
+        InputError: the name is neither "files" nor "milvus:URI"; the URI is neither a .db file nor
+            an http address; or the store cannot hold the type (Milvus holds only float32).
     """
     if name != "files":
         require(name.startswith(_MILVUS), f"store: found {name!r}, expected files or milvus:URI")

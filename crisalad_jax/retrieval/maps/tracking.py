@@ -61,8 +61,8 @@ class SequenceTracker:
         """Update the camera's state with the next frames, and rank the map's images for each.
 
         The first call decides how motion is measured: in metres if all images of the map have
-        positions and the names of its frames contain @UTM positions; else in seconds if all names
-        contain times; else in images of the map per frame, with a warning. `SeqSlam` counts images.
+        positions and the names of all its frames contain @UTM positions; else in seconds if all
+        names contain times; else as one image per frame, with a warning. `SeqSlam` counts images.
 
         Args:
             descriptors: unit descriptors of the frames, in order, by the map's model.

@@ -36,7 +36,7 @@ def verify_answers(
         and the pose of the query's camera on the map, or None if no two answers determine it.
 
     Raises:
-        InputError: what `Verifier.check` raises, such as if no answer's image can be read.
+        InputError: no answer's image can be read, or intrinsics or depth images are unsuitable.
     """
     names = [(each.root, each.name) for each in found]
     checks = verifier.check(image, names)

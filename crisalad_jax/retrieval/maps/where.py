@@ -61,7 +61,7 @@ class Where:
                 box=11.5,48.1,11.6,48.2". Each key is optional; a time may have two bounds.
 
         Raises:
-            InputError: an unknown key, a repeated folder or box, or a value that does not parse.
+            InputError: a key is unknown, `folder` or `box` is repeated, or a value does not parse.
         """
         found: dict[str, Any] = {}
         for part in re.split(r",(?=\s*\w+\s*[<>=])", text):
@@ -93,8 +93,8 @@ class Where:
             axes: axes of the images' positions (`positions.AXES`); None without positions.
 
         Raises:
-            InputError: no image is left; a box, but the map has no positions; or a box in metres
-                whose west is larger than its east.
+            InputError: no image is left; a box is given, but the map has no positions; or the west
+                of a box in metres is larger than its east.
         """
         masks: dict[str, Bool[np.ndarray, " row"]] = {}
         if self.folder:

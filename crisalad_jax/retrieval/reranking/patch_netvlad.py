@@ -35,7 +35,7 @@ WINDOWS = ((2, 0.45), (5, 0.15), (8, 0.4))
 def windows_of(config: ModelConfig) -> list[tuple[int, float, Grid]]:
     """List side, weight and grid (rows, columns) of the window sizes that fit a model's images.
 
-    Sizes of which fewer than 2 x 2 windows fit are left out: a single one cannot be displaced.
+    Sizes of which fewer than 2 x 2 windows fit are left out: a single window cannot be displaced.
 
     Raises:
         InputError: no window size fits.

@@ -16,7 +16,7 @@ class SecondStage:
     """A callable that re-ranks the first neighbours of each query; use it as a context manager."""
 
     def __init__(self, label: str, top: int, reading: Reading) -> None:
-        """Set the label of progress bars, the neighbours to re-rank, and how images are read."""
+        """Set the progress bars' label, how many neighbours to re-rank, and how to read images."""
         self._label, self._top, self._reading = label, top, reading
         self._scores: dict[tuple[int, int], Any] = {}
 

@@ -102,7 +102,7 @@ class Reranking:
     name: str
     """Method: patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum with a NetVLAD model; fol,
     pair-vpr, selavpr or transvpr with a model of that aggregator; selavprpp with a selavprpp-hash
-    model; sinkhorn-divergence with one that has local tokens; local with SIFT or `matcher`."""
+    model; sinkhorn-divergence with any model with local tokens; local with SIFT or `matcher`."""
     top: int
     """Number of best retrievals per query to re-rank; the others stay in their places."""
     model: Model | None = None
@@ -132,8 +132,8 @@ class Reranking:
         """Check that this re-ranking can follow a first stage whose model has `config`.
 
         Raises:
-            InputError: the model for local features has another aggregator or size rule, or images
-                of too few patches; or `top` is above the number of `database` images, if given.
+            InputError: the method cannot use the model for local features (its aggregator, size
+                rule, image size or descriptors); or `top` is above the number of `database` images.
         """
         method, own = _METHODS[self.name], config if self.model is None else self.model.config
         if method is not None:
@@ -159,7 +159,7 @@ class Reranking:
         """Create the second stage for these images; use it as a context manager.
 
         Raises:
-            InputError: no `model` for a method that needs one; what `check` or `Verifier` raises.
+            InputError: the method needs a `model`, and it is None; or `check` or `Verifier` fails.
         """
         if self.needs_model:
             return Reranker(self, database, queries, reading)
@@ -195,9 +195,9 @@ class Reranker(SecondStage):
     """Re-ranks the neighbours of any number of first stages over the same images.
 
     Local features of the queries and of the retrieved database images are computed once, in batches
-    of `batch_size`, and stored in temporary files, mostly in float16, which the system caches in
-    memory if there is room. Scores of pairs stay in memory. The device scores up to 16 candidates
-    of a query at a time, in one compiled program.
+    of `reading.batch_size`, and stored in temporary files, mostly in float16; the system caches
+    these in memory if there is room. Scores of pairs stay in memory. The device scores up to 16
+    candidates of a query at a time, in one compiled program.
     """
 
     def __init__(
@@ -210,7 +210,7 @@ class Reranker(SecondStage):
         """Prepare the second stage of a re-ranking with a model; use it as a context manager.
 
         Raises:
-            InputError: no model is given, or what `Reranking.check` raises.
+            InputError: no model is given, or `Reranking.check` refuses it.
         """
         method = _METHODS[reranking.name]
         if method is None or reranking.model is None:

@@ -130,7 +130,7 @@ class Neighbour:
     position: dict[str, float] | None
     """east and north, or x and y, in metres; or lat and lon in degrees; null if unknown."""
     number: int
-    """Its thumbnail is at /images/{number}, even after other images are removed from the map."""
+    """The image's thumbnail is at /images/{number}, even after other images are removed."""
     verified: Verified | None = None
     """Verification, for the first answers if the service verifies them; otherwise null."""
 
@@ -169,7 +169,7 @@ class Health:
     search: str
     """How the map is searched: exact, hnsw, ivf-rabitq, or with Milvus also diskann."""
     stale_search: str | None
-    """Kind of an approximate search for other images, unused until rebuilt; otherwise null."""
+    """Kind of an approximate search built for other images, so unused; null if there is none."""
     uptime_s: float
 
 

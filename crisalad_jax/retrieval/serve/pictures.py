@@ -82,10 +82,10 @@ async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str
 
 
 def check_picture(data: bytes, name: str, most_pixels: int) -> float:
-    """Check a picture's header; return its number of pixels, or infinity if it may be exceeded.
+    """Check a picture's header, and return its pixel count; infinity if decoding may exceed it.
 
     Raises:
-        InputError: not an accepted format, too many pixels, or a JPEG with too many scans.
+        InputError: the format is not accepted, or the picture has too many pixels or (JPEG) scans.
     """
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:

@@ -75,8 +75,7 @@ def serve_map(
     Args:
         folder: folder of the map.
         weights: file of the model that made the map; None is the one that the map records.
-        engine: "jax", "onnxruntime" or "openvino"; or "auto", the one that `Map.fastest_engine`
-            chooses.
+        engine: "jax", "onnxruntime", "openvino", or "auto" for the choice of `Map.fastest_engine`.
         host: name or address to listen on. One that other machines can reach needs a token.
         port: port to listen on; 0 picks a free one.
         token: token that requests must send as `Authorization: Bearer ...`; None for no token.
@@ -88,17 +87,18 @@ def serve_map(
         batch_size: maximum number of pictures described together, each independently.
         tiles: address of street map tiles, which browsers draw behind the map's places:
             https://tile.openstreetmap.org/{z}/{x}/{y}.png. None draws none.
-        tiles_attribution: text shown with tiles; None is what OpenStreetMap requires for its own.
+        tiles_attribution: text shown with tiles; None is OpenStreetMap's for its tiles, else none.
         rerank: how to verify the best answers by local features; None for no verification.
         verify: whether to compare the map's descriptors with their checksums.
         quiet: whether to hide the progress bar.
         ready: called with (address, engine) once the service answers.
 
     Raises:
-        InputError: a number out of range; an address that is not this machine's, is in use, or can
-            be reached by others without a token; a missing folder; tiles for a map in neither
-            degrees nor a known UTM zone; appending with a model other than the map's; or what
-            `Map.open`, `Map.fastest_engine`, `Map.load_model` and `open_for_appending` raise.
+        InputError: a number is out of range; the address is not this machine's, is in use, or can
+            be reached by others without a token; a folder is missing; there are tiles, but the map
+            is in neither degrees nor a known UTM zone; `append` is set, and the model is not the
+            map's; or `Map.open`, `Map.fastest_engine`, `Map.load_model` or `open_for_appending`
+            fails.
 
     Example:
         >>> serve_map("city.map", host="0.0.0.0")

@@ -36,8 +36,8 @@ def open_tiles(url: str, attribution: str | None, places: Map) -> Tiles:
         places: the map.
 
     Raises:
-        InputError: the address is not one of tiles; or the map's positions are neither in degrees
-            nor in metres of a known UTM zone.
+        InputError: the address is not http(s) with {z}, {x} and {y}; or the map's positions are
+            neither in degrees nor in metres of a known UTM zone.
     """
     if not _ADDRESS.fullmatch(url) or any(url.count(f"{{{axis}}}") != 1 for axis in "xyz"):
         raise InputError(

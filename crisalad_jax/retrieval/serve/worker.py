@@ -64,10 +64,10 @@ class MapWorker:
     """A thread that answers questions in batches and appends images; close it at the end."""
 
     def __init__(self, places: Map, describer: Describer, *, batch_size: int) -> None:
-        """Take the map, open for appending if images will be added, and the model that made it.
+        """Take the map, and the model that made it.
 
         Args:
-            places: the map, which the thread owns until `close`.
+            places: the map, which the thread owns until `close`; for additions, an `AppendableMap`.
             describer: the model that made the map.
             batch_size: maximum number of images described together.
         """
@@ -100,10 +100,10 @@ class MapWorker:
         """Queue a question or an addition.
 
         Returns:
-            A future. For a question, its result is (the searched map, [(number, similarity), ...]),
-            the k most similar images first; for an addition, the new image's number. It raises
-            `InputError` if no image meets the conditions or the map refuses the addition
-            (`NameTakenError` for its name), and `MapFailedError` for everything else.
+            A future. For a question, its result is (the searched map, [(number, similarity), ...])
+            of the k most similar images, best first; for an addition, the new image's number. The
+            future raises `InputError` if no image meets the conditions or the map refuses the
+            addition (`NameTakenError` for its name), and `MapFailedError` for everything else.
         """
         result: Future[Any] = Future()
         self._waiting.append((work, result))

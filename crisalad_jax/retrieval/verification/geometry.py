@@ -58,7 +58,7 @@ def rotation_only(
     Args:
         first: directions of points from the first camera.
         second: directions of the same points from the second.
-        distance: maximum distance between unit rays after rotation, met by nine points in ten.
+        distance: maximum distance between unit rays after rotation, for at least 90 % of points.
     """
     if len(first) < LEAST:
         return None
@@ -96,7 +96,7 @@ def relative_pose(first: Points, second: Points, distance: float) -> Pose | None
 def pose_from_points(
     points: Float64[np.ndarray, "n 3"], directions: Points, distance: float
 ) -> Pose | None:
-    """Compute a camera's pose from 3D points in metres and their directions, by PnP; or None."""
+    """Compute a camera's pose from 3D points (metres) and directions, by PnP; None if it fails."""
     if len(points) < LEAST:
         return None
     eye = np.eye(3)
@@ -117,7 +117,7 @@ def pose_from_points(
 
 
 def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarray, "n 3"]:
-    """Triangulate points, in the second camera's axes, from their directions from two cameras.
+    """Triangulate points in the second camera's axes from their directions from two cameras.
 
     Coordinates are in the unit of the pose's translation; points behind a camera are NaN.
     """
@@ -129,7 +129,7 @@ def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarra
 
 
 def common_points(first: Points, second: Points) -> tuple[Int64[np.ndarray, " m"], ...]:
-    """Return the rows at which two lists of keypoints of one image have the same keypoint."""
+    """Return the rows, in each of two arrays of keypoints, of the keypoints that are in both."""
     rows = {tuple(point): row for row, point in enumerate(first.tolist())}
     points = map(tuple, second.tolist())
     pairs = [(rows[point], row) for row, point in enumerate(points) if point in rows]
@@ -145,7 +145,7 @@ def pose_on_map(
     """Compute where a level camera is on a map, and its heading, from two answers' positions.
 
     Args:
-        pose: pose from the camera to that of the first answer, in metres.
+        pose: pose from the camera to the first answer's camera, in metres.
         other: vector from the first answer's camera to the second's, in the first's axes.
         here: position of the first answer, in metres east and north.
         there: position of the second answer.

@@ -43,7 +43,7 @@ class SiftFeatures(NamedTuple):
 
 
 class SiftMatcher:
-    """A matcher of SIFT (Lowe, IJCV 2004) as RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
+    """A matcher of RootSIFT features (Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012)."""
 
     name: str = "sift"
     """Name of the matcher; inliers of different matchers are not comparable."""

@@ -38,7 +38,7 @@ class Verification(NamedTuple):
     depth or a second answer at a known distance."""
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields for JSON, without points, the rotation as a quaternion (x, y, z, w)."""
+        """Return the fields except points, for JSON; the rotation is a quaternion (x, y, z, w)."""
         fields: dict[str, Any] = {"inliers": self.inliers, "matches": self.matches}
         fields["confidence"] = round(self.confidence, 4)
         if self.rotation is not None:

@@ -68,8 +68,8 @@ class Verify:
     map_images: str | os.PathLike[str] | None = None
     """Folder of the map's images; None is the one from which they were indexed."""
     map_depth: str | os.PathLike[str] | None = None
-    """Folder of depth for the map's images: 16-bit PNGs in millimetres under the images' names,
-    0 where unknown. Answers with depth have a translation in metres."""
+    """Folder of depth images: 16-bit PNGs in millimetres, named after the map's images, 0 where
+    unknown. Answers with depth have a translation in metres."""
     min_inliers: int | None = None
     """Minimum number of inliers of the best answer; with fewer, the place counts as unknown. None
     takes the number from the map's calibration, if any."""

@@ -1,6 +1,6 @@
 """Losses on the descriptors of a batch, and the miner that chooses which pairs enter them.
 
-A loss that pytorch-metric-learning also has gives the same values on unit descriptors.
+On unit descriptors, losses that are also in pytorch-metric-learning have the same values there.
 """
 
 import importlib

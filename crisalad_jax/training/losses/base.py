@@ -34,9 +34,9 @@ class LossBatch:
     """The inputs of a loss for one batch."""
 
     descriptors: Float[Array, "image descriptor"]
-    """Unit descriptors, in float32 at least."""
+    """Unit descriptors, in float32 or higher precision."""
     labels: Int[Array, " image"]
-    """Place, or class, of each image."""
+    """Place or class of each image; for mined tuples, its label from `tuple_labels`."""
     valid: Bool[Array, " image"]
     """Whether each image takes part; the others are not in any pair, even as anchors."""
     pairs: Pairs
@@ -44,7 +44,7 @@ class LossBatch:
     classes: Int[Array, ""] | int | None = None
     """Number of classes, if the loss has a vector for each."""
     tokens: Float[Array, "image token dim"] | None = None
-    """The images' local or dense tokens, as the loss's `reads_tokens` says; else None."""
+    """Local or dense tokens of the images (`Loss.reads_tokens`); None if the loss reads none."""
     targets: Float[Array, "image target"] | None = None
     """A teacher's unit descriptors of the images, for a loss whose `reads_targets` is True."""
 
@@ -62,7 +62,7 @@ class LossBatch:
 
     @property
     def anchors(self) -> Int[Array, ""]:
-        """Number of valid images, as a divisor: 1 if there are none."""
+        """Number of valid images, but at least 1, so that it can be a divisor."""
         return jnp.maximum(self.valid.sum(), 1)
 
 
@@ -172,7 +172,7 @@ LOSSES = Registry("loss", Loss, of_function=_of_function)
 
 
 def inner_products(descriptors: Float[Array, "image descriptor"]) -> Similarities:
-    """Return the inner products of all descriptors, in float32 at least."""
+    """Return the inner products of all pairs of descriptors, in float32 or higher precision."""
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
     return jnp.matmul(wide, wide.T, precision="highest")
 
@@ -184,7 +184,7 @@ def mean_of_positive(losses: Float[Array, "*shape"]) -> Float[Array, ""]:
 
 
 def log_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Array, " anchor"]:
-    """Compute log(sum(exp(x))) over each row's `where`; an empty row is 0, with finite gradient."""
+    """Compute each row's log-sum-exp over `where`; 0, with a finite gradient, for an empty row."""
     some = where.any(axis=1, keepdims=True)
     # A row without chosen entries sums all of them, to a finite number that is not used.
     chosen = jnp.where(where | ~some, x, -jnp.inf)
@@ -192,7 +192,7 @@ def log_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Ar
 
 
 def log1p_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Array, " anchor"]:
-    """Compute log(1 + sum(exp(x))) over each row's `where`, with a stable gradient."""
+    """Compute log(1 + sum(exp(x))) of each row over `where`, with a stable gradient."""
     chosen = jnp.where(where, x, -jnp.inf)
     # A column of zeros adds the 1 inside the logarithm, and keeps an empty row finite.
     return jax.nn.logsumexp(jnp.pad(chosen, ((0, 0), (0, 1))), axis=1)

@@ -1,4 +1,4 @@
-"""Distillation of descriptors: the teacher's values, relations in a batch, and neighbours."""
+"""Distillation loss: match a teacher's descriptors, their distances and their neighbours."""
 
 import dataclasses
 from typing import ClassVar
@@ -21,10 +21,10 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 
 @LOSSES.register("distil")
 class DistilConfig(Loss):
-    """Distillation from a teacher's descriptors of the same images, which may be longer.
+    """Distillation from a teacher, whose descriptors may be longer than the student's.
 
-    The loss is the weighted sum of `cosine`, `relations`, `neighbours` and `labels`; a term of
-    weight 0 is not computed. Only `labels` uses the images' places.
+    The loss is a sum of four terms, whose weights are `cosine`, `relations`, `neighbours` and
+    `labels`; a term of weight 0 is not computed. Only the term `labels` uses the images' places.
     """
 
     reads_targets: ClassVar[bool] = True
@@ -44,7 +44,7 @@ class DistilConfig(Loss):
     temperature: PositiveFloat = 0.05
     """Temperature of both softmaxes of `neighbours`."""
     labels: NonNegativeFloat = 0.0
-    """Weight of the multi-similarity loss of the images' places."""
+    """Weight of the multi-similarity loss, the only term that uses the images' places."""
 
     def __post_init__(self) -> None:
         """Check that at least one weight is above 0."""

@@ -37,7 +37,7 @@ class SinkhornDivergenceLoss(MultiSimilarityConfig):
         return dataclasses.replace(self, base=0.5)
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Add the weighted triplet loss, averaged over anchors with a positive and a negative."""
+        """Add the weighted mean loss of anchors with a triplet to the multi-similarity loss."""
         assert batch.tokens is not None
         # Images that take no part may be NaN.
         tokens = l2_normalise(jnp.where(batch.valid[:, None, None], batch.tokens, 0))

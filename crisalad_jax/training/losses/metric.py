@@ -82,7 +82,7 @@ def metric_loss(
         valid: images that take part; None means all. The others are in no pairs.
         params: the loss's own trainable parameters (`Loss.init`).
         classes: number of classes, if `params` has a vector for each; further vectors are padding.
-        pairs: the pairs to choose from, such as those of `tuple_pairs`; None means all pairs.
+        pairs: the valid pairs to choose from, such as those of `tuple_pairs`; None means all.
         tokens: local tokens or features of each image, for a loss that compares them.
         targets: a teacher's unit descriptors of the images, for a loss that compares them.
 

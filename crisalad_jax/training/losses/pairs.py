@@ -1,4 +1,4 @@
-"""Pairs of images: of places, chosen by a miner, or of mined tuples."""
+"""Find the pairs of a batch, from places or mined tuples, and choose the hard ones."""
 
 import enum
 

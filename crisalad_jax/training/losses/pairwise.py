@@ -27,7 +27,7 @@ class MultiSimilarityConfig(Loss):
     beta: PositiveFloat = 50.0
     """Scale of the negatives' similarities, the paper's beta."""
     base: float = 0.0
-    """Similarity around which pairs are weighted. From random weights, 0.5 learns but 0 fails."""
+    """Similarity around which pairs are weighted. With random initial weights, 0 fails; use 0.5."""
 
     def from_scratch(self) -> Loss:
         """Return the default loss with base 0.5: base 0 would drive all similarities to 0."""

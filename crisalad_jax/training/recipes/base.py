@@ -73,7 +73,7 @@ def recipe(
         The configuration of a training run.
 
     Raises:
-        InputError: no such preset, recipe or part, or one that does not fit the preset.
+        InputError: the preset, recipe or part does not exist, or they do not fit together.
 
     Example:
         >>> recipe("b14").optimiser.learning_rate
@@ -157,7 +157,7 @@ def model_of(
 
 
 def validation_size(preset: str, side: int) -> tuple[int, int] | None:
-    """Return (side, side), the image size for validation; for tiny None, the model's own size."""
+    """Return (side, side) as the validation size; for preset `tiny` None, the model's own size."""
     return None if preset == "tiny" else (side, side)
 
 
@@ -302,8 +302,8 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
 
     The recipe's model and kind of loss stay, because they define its method. The optimiser, the
     loss's constants, the augmentation and the batches are those of `scratch`. The whole model
-    trains, in float32. A plug-in's augmentation stays, and so do batches of mined tuples and of a
-    mixture of sets.
+    trains, in float32. Exceptions: an augmentation from a plug-in stays, and so do batches that
+    consist of mined tuples or mix several data sets.
 
     Args:
         config: the recipe.

@@ -1,4 +1,4 @@
-"""Recipes of visual words of hand-crafted features, which only `with_vocabulary` trains."""
+"""Recipes for visual words of hand-crafted features; only `with_vocabulary` fits the words."""
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS

@@ -83,8 +83,8 @@ def eigenplaces_turns(model: ModelConfig, preset: str) -> TrainConfig:
 def cosplace_vit(model: ModelConfig, preset: str) -> TrainConfig:
     """Make CosPlace's recipe for the preset's ViT, whose adapters and head train.
 
-    Images have the ViT's size, and RandAugment changes them. The classes are GSV-Cities' places,
-    because each of them is one spot in one direction.
+    Images are resized to the ViT's input size and augmented by RandAugment. The classes are
+    GSV-Cities' places, because each of them is one spot in one direction.
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(steps=10_000))
     head = AGGREGATORS.make("cosplace", preset)

@@ -87,7 +87,7 @@ def boq_resnet50(model: ModelConfig, preset: str) -> TrainConfig:
 
 @register_recipe("starter")
 def starter(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of the second run of `starter`, on 24,000 places (`render --scenes 6000`).
+    """Make the recipe of the second run of model `starter`: 24,000 places (`render --scenes 6000`).
 
     That run started from the weights of an earlier one on smaller images; see docs/starter.md.
     """

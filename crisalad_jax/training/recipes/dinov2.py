@@ -1,4 +1,4 @@
-"""Recipes over DINOv2, as the authors' code trains it, where that is published.
+"""Recipes for methods over DINOv2, after the authors' training code where it is published.
 
 Only CricaVPR's has a cross-image encoder. If a method's code validates at a larger image size than
 it trains at, so does its recipe, except for preset tiny, which validates at the training size.
@@ -104,7 +104,7 @@ def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
     """Make CricaVPR's recipe, from Lu-Feng/CricaVPR (Lu et al., CVPR 2024).
 
     It has multi-resolution adapters, a GeM pyramid, and Adam with step decay. The code's README
-    trains for 10 epochs, too few for its patience of 10 to take effect. The best weights are those
+    sets 10 epochs, too few for its patience of 10 to take effect. The best weights are those
     with the best R@5, as in the current code; its first version took the sum of R@1 and R@5.
     """
     backbone = _vit(model, adapter="multi-resolution")
@@ -123,9 +123,9 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
     """Make SelaVPR's recipe, from Lu-Feng/SelaVPR (ICLR 2024): preset l14, tuples mined in MSLS.
 
     A batch is 4 tuples of a query, a positive and 2 negatives; the loss compares descriptors and
-    local features. An epoch has 30,000 queries, in rounds of 1,000. For Pitts30k, which starts from
-    the MSLS weights, it has 5,000: `--mining.queries-per-epoch 5000`. The code validates with
-    re-ranking; this recipe does not.
+    local features. An epoch has 30,000 queries, in rounds of 1,000. Training on Pitts30k starts
+    from the MSLS weights, with 5,000 queries per epoch (`--mining.queries-per-epoch 5000`). The
+    code validates with re-ranking; this recipe does not.
     """
     backbone = _vit(model, adapter="serial-parallel")
     return TrainConfig(
@@ -147,9 +147,9 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
 def selavprpp(model: ModelConfig, preset: str) -> TrainConfig:
     """Make SelaVPR++'s recipe, from Lu-Feng/SelaVPRplusplus (Lu et al. 2025): its first stage.
 
-    The head trains, and adapters on a path parallel to the frozen blocks (for preset l14, the last
-    16). The authors train on GSV-Cities and parts of other sets, as places in one layout. The
-    second stage, which trains another path for the signs of the descriptor, is not included.
+    The head trains, and so do adapters on a path parallel to the frozen blocks (for preset l14, to
+    the last 16). The authors train on GSV-Cities and parts of other sets, as places in one layout.
+    The second stage, which trains another path for the signs of the descriptor, is not included.
     """
     is_large = preset == "l14"
     adapter = SideMultiResolutionConfig(last=16 if is_large else None)
@@ -317,8 +317,8 @@ def megaloc(model: ModelConfig, preset: str) -> TrainConfig:
     """Make an open recipe for MegaLoc (Berton and Masone 2025), whose code is not published.
 
     Its paper adds the losses of six sub-batches of 32 places: GSV-Cities, MSLS (cliques),
-    MegaScenes, ScanNet, and San Francisco XL twice (EigenPlaces' lateral and frontal classes), as
-    `--data gsv=DIR msls=DIR megascenes=DIR scannet=DIR lateral=DIR frontal=DIR`, or some of them.
+    MegaScenes, ScanNet, and San Francisco XL twice (EigenPlaces' lateral and frontal classes). Pass
+    all or some: `--data gsv=DIR msls=DIR megascenes=DIR scannet=DIR lateral=DIR frontal=DIR`.
     The paper chooses quadruplets of MegaScenes and ScanNet by overlapping views; here you list such
     places in a table. The optimiser, the trainable parameters and the epochs are SALAD's.
     """

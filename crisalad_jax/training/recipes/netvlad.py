@@ -28,8 +28,8 @@ def _model(model: ModelConfig, preset: str, **head: Any) -> ModelConfig:
 def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     """Make NetVLAD's recipe, from Nanne/pytorch-NetVlad: tuples mined in pitts30k_train.mat.
 
-    The last stage of VGG-16 trains. A batch is 4 tuples of 12 images. Every 1,000 queries, all
-    images are described again, and each query takes the 10 hardest of its previous negatives and
+    The last stage of VGG-16 trains. A batch is 4 tuples of 12 images. Every 1,000 queries, the
+    database is described again, and each query takes the 10 hardest of its previous negatives and
     1,000 random ones, if they violate the margin.
 
     The code's schedule steps before an epoch, not after it, so the first four epochs have the full
@@ -62,8 +62,8 @@ def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
 
     The code draws queries with replacement, those at night or sideways more often; here each is
     used in turn. The code leaves out candidates near any query of a round; here, those near the
-    tuple's own query. The code's sign of inner products lets nearly all queries pass its margin
-    test; here all pass. Patch re-ranking learns nothing; `crisalad pca` fits the whitening.
+    tuple's own query. In the code, the sign of inner products lets nearly all queries pass the
+    margin test; here all pass. Patch re-ranking learns nothing; `crisalad pca` fits the whitening.
     """
     return dataclasses.replace(
         netvlad(model, preset),
