@@ -77,7 +77,7 @@ class ExportConfig:
 
     grouping: Literal["single", "batch", "any"] = "single"
     """Which images of a call attend to each other: "single", none; "batch", all; "any", those that
-    a mask allows (ONNX and OpenVINO only: one program makes tokens, a second one descriptors)."""
+    a mask allows (ONNX and OpenVINO only, as two programs: images to tokens, then descriptors)."""
     batch_size: int | None = None
     """Number of images in a call; None allows any number (a symbolic dimension)."""
     weights_inside: bool = False

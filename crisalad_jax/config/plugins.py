@@ -166,7 +166,7 @@ def load_entry_points() -> None:
 def source_digest(part: type[Part]) -> str | None:
     """Compute the SHA-256 of the file that defines a part of a plug-in.
 
-    It is None without a file, and for parts of this package, which the version identifies.
+    Return None if there is no such file, or for parts of this package (its version is enough).
     """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
     if part.__module__.partition(".")[0] == _PACKAGE or file is None:

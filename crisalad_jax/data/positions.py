@@ -57,8 +57,8 @@ class Positions(NamedTuple):
     ) -> "Positions":
         """Return the positions in the axes and zone of a map.
 
-        For a map in metres, degrees and metres of another zone become metres of its zone; for a map
-        in degrees, metres become degrees. Results are rounded to a tenth of a millimetre.
+        Degrees, and metres of another zone, become metres of the map's zone, or degrees for a map
+        in degrees. Results are rounded to a tenth of a millimetre.
 
         Args:
             source: the map, for messages.

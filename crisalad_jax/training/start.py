@@ -152,14 +152,14 @@ def read_start(
     Warn about weights that were trained on images of another size or resized in another way.
 
     Args:
-        config: the run's configuration; `recipe` can make it for the model of given weights.
+        config: the run's configuration; the function `recipe` makes one that fits given weights.
         weights: a complete model of this package, or the name of a published model.
-        backbone: a checkpoint from which only the backbone is taken, public or of this package, or
-            the name of a published model.
+        backbone: a checkpoint (public or of this package) or the name of a published model, of
+            which only the backbone is used.
         quiet: whether to hide the progress bar of a download.
 
     Returns:
-        All parameters; None, which stands for random ones, without `weights` and `backbone`.
+        All parameters; or None, for random ones, if neither `weights` nor `backbone` is given.
 
     Raises:
         InputError: `weights` and `backbone` are both given, or a file is unreadable or unsuitable.

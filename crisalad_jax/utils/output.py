@@ -18,7 +18,7 @@ class Note(UserWarning):
 
 
 def warn(message: str) -> None:
-    """Warn the user in one line; the command line prints it, Python code gets a `Note`.
+    """Warn the user in one line, which commands print; Python code gets a warning (`Note`).
 
     The warning points to the nearest calling line outside of this package.
     """

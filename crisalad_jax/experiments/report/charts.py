@@ -158,7 +158,7 @@ def outcomes_of(neighbours: Neighbours, positives: Sequence[Int[np.ndarray, " _"
 
 
 class Positions(NamedTuple):
-    """Positions of images in metres, and which images are placed: at a plausible position."""
+    """Positions of images in metres, and which images have a plausible position."""
 
     database: Float[np.ndarray, "n axis"]
     queries: Float[np.ndarray, "q axis"]

@@ -28,7 +28,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 @pytree_dataclass
 class Sage:
-    """The networks over features, and those that compute patch weights and the exponent."""
+    """The networks that map features, and those that compute patch weights and an exponent."""
 
     weighting: TwoLayer
     """Network from the L2 norm of a patch to its weight."""
@@ -36,7 +36,7 @@ class Sage:
     cluster_features: TwoLayer
     score: TwoLayer
     power: TwoLayer
-    """Network from each cluster's mean over its features to the exponent in `layers.powers`."""
+    """Network from the clusters' means (each over the features) to the exponent of `powers`."""
 
 
 @AGGREGATORS.register(
@@ -62,7 +62,7 @@ class SageConfig(Aggregator):
     token_dim: PositiveInt = 256
     """Width of the global token."""
     hidden: PositiveInt = 512
-    """Hidden width of the networks over features."""
+    """Hidden width of the networks that map features."""
     weighting_hidden: PositiveInt = 128
     """Hidden width of the network that weights patches by their norm."""
 

@@ -159,8 +159,8 @@ class ScalingProblem(Problem):
         row_max: each row's largest score, divided by epsilon.
         gibbs: exp(clusters - row_max).
         gibbs_last: exp(last - row_max).
-        in_range: whether the scores of every row, in the whole batch, are close enough for exact
-            sums (`SCALING_RANGE`). If not, all sums are finite but wrong.
+        in_range: whether, in every row of the batch, the scores are close enough to each other for
+            exact sums (`SCALING_RANGE`). If not, all sums are finite but wrong.
     """
 
     row_max: Rows = dataclasses.field(kw_only=True)

@@ -34,8 +34,8 @@ class Verification(NamedTuple):
     """Unit vector from the answer's camera to the query's, in the answer camera's axes. None if
     `rotation` is None, or if both cameras were at the same place."""
     translation: Float64[np.ndarray, " 3"] | None = None
-    """Metres from the answer's camera to the query's, in the answer camera's axes; None without
-    depth or a second answer at a known distance."""
+    """Metres from the answer's camera to the query's, in the answer camera's axes; None if there is
+    neither depth nor a second answer at a known distance from this one."""
 
     def fields(self) -> dict[str, Any]:
         """Return the fields except points, for JSON; the rotation is a quaternion (x, y, z, w)."""

@@ -319,8 +319,8 @@ def megaloc(model: ModelConfig, preset: str) -> TrainConfig:
     Its paper adds the losses of six sub-batches of 32 places: GSV-Cities, MSLS (cliques),
     MegaScenes, ScanNet, and San Francisco XL twice (EigenPlaces' lateral and frontal classes). Pass
     all or some: `--data gsv=DIR msls=DIR megascenes=DIR scannet=DIR lateral=DIR frontal=DIR`.
-    The paper chooses quadruplets of MegaScenes and ScanNet by overlapping views; here you list such
-    places in a table. The optimiser, the trainable parameters and the epochs are SALAD's.
+    In the paper, a place of MegaScenes or ScanNet is four images with overlapping views; here you
+    list these places in a table. Optimiser, trainable parameters and epochs are SALAD's.
     """
     whole = model_of(
         *(model, preset, _vit(model), "salad"),
