@@ -4,13 +4,18 @@ import contextlib
 import os
 import pathlib
 import shutil
-import tarfile
+import sys
 import zipfile
 import zlib
 
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import is_html, wrap_os_errors
 from crisalad_jax.utils.progress import Bar, progress_bar
+
+if sys.version_info >= (3, 11, 4):
+    import tarfile
+else:  # Debian 12 has 3.11.2, whose tarfile has no filters
+    from backports import tarfile
 
 _ZIP, _TAR = (".zip",), (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
 
