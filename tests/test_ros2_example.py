@@ -74,7 +74,7 @@ def bag(database, tmp_path) -> pathlib.Path:
 
 
 def handled(ros: Ros) -> int:
-    """How many images were answered or passed over, as the node says."""
+    """How many images were answered or dropped, as the node says."""
     return sum(1 + int(values(place)["dropped"]) for place in ros.published["~/place"])
 
 
@@ -117,7 +117,7 @@ def test_a_bag_is_answered_image_by_image(maps, bag, monkeypatch):
         assert pose.header.frame_id == "map"
     assert "5 places, waiting for images of /camera/image_raw" in ros.said
     assert ros.said[-2].startswith("5 answers, latency median ")
-    assert "passed over" not in ros.said[-2]
+    assert "dropped" not in ros.said[-2]
     assert ros.said[-1] == "destroyed"
     assert not ros.is_up
 
@@ -129,7 +129,7 @@ def test_images_faster_than_answers_are_answered_or_counted(maps, bag, monkeypat
     assert handled(ros) == 100
     assert 1 < answered < 100
     assert ros.said[-2].startswith(f"{answered} answers, latency median ")
-    assert ros.said[-2].endswith(f"; {100 - answered} frames passed over")
+    assert ros.said[-2].endswith(f"; {100 - answered} frames dropped")
 
 
 def test_degrees_are_a_fix_and_no_positions_are_a_name(maps, bag, monkeypatch):

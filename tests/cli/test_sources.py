@@ -221,8 +221,8 @@ def test_a_bag_is_replayed_and_no_frame_is_lost(town_map, tmp_path, capfd):
     assert ready == f"crisalad: ready, taking frames from {bag}; by jax"
     assert summary.startswith(f"crisalad: {len(lines)} answer")
     passed = 40 - len(lines)
-    words = {0: " ms", 1: "; 1 frame passed over"}
-    assert summary.endswith(words.get(passed, f"; {passed} frames passed over"))
+    words = {0: " ms", 1: "; 1 frame dropped"}
+    assert summary.endswith(words.get(passed, f"; {passed} frames dropped"))
     given = query(town_map, "--camera", bag, "--topic", "/front")
     fails(capfd, *given, words=("found --topic /front, expected", "/camera/image_raw (Image, 40)"))
     fails(capfd, *query(town_map, "--camera", bag, "--rate", 0), words=("rate: found 0, expected",))

@@ -159,13 +159,13 @@ def latency_words(milliseconds: Sequence[float], dropped: int) -> str:
 
     Example:
         >>> latency_words([20.0, 21.0, 22.0], 4)
-        '3 answers, latency median 21.0 ms, 95th percentile 21.9 ms; 4 frames passed over'
+        '3 answers, latency median 21.0 ms, 95th percentile 21.9 ms; 4 frames dropped'
     """
-    passed = f"; {counted(dropped, 'frame')} passed over" if dropped else ""
+    end = f"; {counted(dropped, 'frame')} dropped" if dropped else ""
     if not milliseconds:
-        return f"no answers{passed}"
+        return f"no answers{end}"
     median, high = np.percentile(milliseconds, (50, 95))
     return (
         f"{counted(len(milliseconds), 'answer')}, latency median {median:.1f} ms, 95th percentile "
-        f"{high:.1f} ms{passed}"
+        f"{high:.1f} ms{end}"
     )

@@ -87,7 +87,7 @@ def test_a_watched_folder_and_a_camera(town_map, shared, params, tmp_path):
 
 
 def test_frames_from_another_thread(town_map, shared, params):
-    """As a callback of ROS puts them: the newest is answered, and those passed over are counted."""
+    """As a callback of ROS puts them: the newest is answered, and those dropped are counted."""
     paths = list_images(shared / "town" / "images" / "test" / "database")[:5]
     images = [read_image(path) for path in paths]
     latest = LatestFrame()
@@ -151,9 +151,9 @@ def test_latencies_in_words():
     # By hand: of 1 to 21 the 11th, and the 20th.
     words = "21 answers, latency median 11.0 ms, 95th percentile 20.0 ms"
     assert latency_words(range(1, 22), 0) == words
-    assert latency_words(range(1, 22), 1) == f"{words}; 1 frame passed over"
+    assert latency_words(range(1, 22), 1) == f"{words}; 1 frame dropped"
     assert latency_words([], 0) == "no answers"
-    assert latency_words([], 3) == "no answers; 3 frames passed over"
+    assert latency_words([], 3) == "no answers; 3 frames dropped"
 
 
 def test_what_is_refused(town_map, params):
