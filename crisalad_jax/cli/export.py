@@ -37,8 +37,9 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
     """For onnx: use the inputs and outputs of COLMAP's unreleased retrieval by global descriptors
     (docs/export.md)."""
     int8: pathlib.Path | None = None
-    """For onnx or openvino: quantise matrix products, calibrated on these photographs: a few dozen
-    typical ones, in any image source (of a video, one a second). Costs recall (docs/export.md)."""
+    """For onnx or openvino: quantise products and convolutions, calibrated on these photographs: a
+    few dozen typical ones, in any image source (of a video, one a second). Costs recall
+    (docs/export.md)."""
     platforms: str | None = None
     """For stablehlo: platforms, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
 
