@@ -44,6 +44,7 @@ class FileStore:
         """Open a folder of descriptors of this length; the first `add` creates the folder."""
         self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
         self._opened_at: os.stat_result | None = None
+        """Identity of the folder whose files were opened first; a rebuilt map has another."""
         self._counts: dict[int, int] = {}
         """Number of descriptors in each file, by the number of its first, in ascending order."""
         self._held: tuple[int, Removed, Block] | None = None
@@ -84,18 +85,17 @@ class FileStore:
         header = npy_header(self._dtype, shape)
         size = len(header) + math.prod(shape) * self._dtype.itemsize
         with path.open("rb") as file:
-            begins = file.read(len(header))
-        at = os.stat(self._folder)
-        self._opened_at = self._opened_at or at
-        if not os.path.samestat(at, self._opened_at):
-            raise InputError(f"{self._folder}: the map was replaced since it was opened")
-        if begins != header or path.stat().st_size != size:
-            raise InputError(
-                f"{path}: found bytes other than {self._dtype} {shape}, expected the whole .npy "
-                "file that was written"
-            )
-        # As a plain array, to avoid what a `memmap` does at each indexing.
-        return np.memmap(path, self._dtype, "r", len(header), shape).view(np.ndarray)
+            at = os.stat(self._folder)  # only now: a folder may be replaced before `open`
+            self._opened_at = self._opened_at or at
+            if not os.path.samestat(at, self._opened_at):
+                raise InputError(f"{self._folder}: the map was replaced since it was opened")
+            if file.read(len(header)) != header or os.fstat(file.fileno()).st_size != size:
+                raise InputError(
+                    f"{path}: found bytes other than {self._dtype} {shape}, expected the whole "
+                    ".npy file that was written"
+                )
+            # As a plain array, to avoid what a `memmap` does at each indexing.
+            return np.memmap(file, self._dtype, "r", len(header), shape).view(np.ndarray)
 
     def drop(self, first: int) -> None:
         """Delete descriptors from number `first` on, whose addition was never committed."""
